@@ -4,7 +4,8 @@ import itertools
 
 import numpy as np
 
-from pdcorrect.fem.mesh import VTK_CORNERS, HexMesh
+from pdcorrect.fem.hexahedron import VTK_CORNERS
+from pdcorrect.fem.mesh import HexMesh
 
 
 def _turns():

@@ -11,7 +11,7 @@ from pdcorrect.batch.elimination import Elimination, alike_cells, rest_blocks, s
 from pdcorrect.batch.first_hessian import LARGEST_REST, FirstHessian, chosen
 from pdcorrect.batch.multigrid import hierarchy, largest_eigenvalue, with_mass
 from pdcorrect.errors import ConvergenceError, InputError
-from pdcorrect.fem.mesh import interpolation, refine
+from pdcorrect.fem.mesh import _lattice, refine
 
 CPU = torch.device("cpu")
 MASS = 1e4
@@ -77,6 +77,15 @@ def matrix(level):
 
 
 # --- the levels ----------------------------------------------------------------------------------
+
+
+def interpolation(mesh, k):
+    """Trilinear, from a mesh's nodes to those of its refinement."""
+    corner, weight, _ = _lattice(mesh, k)
+    rows, columns = np.nonzero(weight)
+    values = weight[rows, columns] / k**3
+    shape = (len(weight), len(mesh.positions))
+    return sp.csr_matrix((values, (rows, corner[rows, columns])), shape=shape)
 
 
 @pytest.mark.parametrize(("k", "shape"), [(2, (3, 2, 1)), (4, (2, 1, 1)), (3, (2, 1, 1))])

@@ -15,7 +15,7 @@ import pdcorrect as pc
 from block_meshes import warped
 from conftest import ELEMENTS, boundary_nodes, box_mesh, held, problem_on, rotation
 from pdcorrect.fem import energies
-from pdcorrect.fem.mesh import VTK_CORNERS, VTK_EDGES, VTK_FACES
+from pdcorrect.fem.hexahedron import VTK_CORNERS, VTK_EDGES, VTK_FACES
 
 SIZE = (1.0, 0.8, 1.1)
 AFFINE = rotation(4) @ np.diag([1.1, 0.9, 1.2])

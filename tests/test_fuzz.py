@@ -31,7 +31,7 @@ from fuzzing import (
 )
 from pdcorrect.cli.common import BAD_INPUT, FAILED
 from pdcorrect.errors import MeshError, PdcorrectError, SceneError
-from pdcorrect.fem.mesh import corner_jacobians
+from pdcorrect.fem.hexahedron import corner_jacobians
 from pdcorrect.fem.mesh_files import read_hex_mesh
 from test_mesh_files import ABAQUS, FORMATS
 

@@ -5,18 +5,15 @@ import pytest
 
 from block_meshes import o_grid, spokes, warped
 from pdcorrect.errors import MeshError, SceneError
-from pdcorrect.fem.hexahedron import gauss_points, jacobians
-from pdcorrect.fem.mesh import (
+from pdcorrect.fem.hexahedron import (
     VTK_CORNERS,
     VTK_EDGES,
     VTK_FACES,
-    HexMesh,
-    boundary_faces,
-    coincident_nodes,
     corner_jacobians,
-    refine,
-    voxel_mesh,
+    gauss_points,
+    jacobians,
 )
+from pdcorrect.fem.mesh import HexMesh, boundary_faces, coincident_nodes, refine, voxel_mesh
 from pdcorrect.fem.mesh_checks import row_groups
 from pdcorrect.scene import Cross, Voxels, Weight
 

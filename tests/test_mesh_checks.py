@@ -5,8 +5,8 @@ import pytest
 
 from block_meshes import TURNS, glue, o_grid, spokes, warped
 from pdcorrect.errors import MeshError
-from pdcorrect.fem.hexahedron import gauss_points, jacobians
-from pdcorrect.fem.mesh import VTK_CORNERS, HexMesh, corner_jacobians, refine, voxel_mesh
+from pdcorrect.fem.hexahedron import VTK_CORNERS, corner_jacobians, gauss_points, jacobians
+from pdcorrect.fem.mesh import HexMesh, refine, voxel_mesh
 from pdcorrect.fem.mesh_checks import _distances
 
 CUBE = VTK_CORNERS.astype(float)

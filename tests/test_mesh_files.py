@@ -8,7 +8,8 @@ import pdcorrect as pc
 from block_meshes import o_grid, warped
 from conftest import beam
 from pdcorrect.errors import MeshError
-from pdcorrect.fem.mesh import HexMesh, corner_jacobians
+from pdcorrect.fem.hexahedron import corner_jacobians
+from pdcorrect.fem.mesh import HexMesh
 from pdcorrect.fem.mesh_files import read_hex_mesh, write_vtu
 from test_mesh import distorted_mesh, volumes
 

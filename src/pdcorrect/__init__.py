@@ -46,80 +46,52 @@ _NAMES = {
 _HOME = {name: module for module, names in _NAMES.items() for name in names}
 _MODULES = ("metrics", "errors", "figures")
 
-__all__ = [  # noqa: RUF022
-    "Scene",
-    "best_coarse",
-    "learned_coarse",
-    "State",
-    "Status",
-    "StepResult",
-    "Stepper",
-    "Trajectory",
-    "Problem",
-    "discretise",
-    "coarse_model",
-    "stress",
-    "modes",
-    "ProjectiveDynamics",
-    "Newton",
-    "adjoint",
-    "BatchStepper",
-    "BatchGradients",
-    "PDLayer",
-    "Corrector",
-    "load_model",
-    "save_model",
-    "HybridStepper",
-    "hybrid_of",
-    "BatchHybrid",
-    "HybridLayer",
-    "Gate",
-    "rollout",
-    "march",
-    "restrict",
-    "reactions",
-    "contact_forces",
-    "load_trajectory",
-    "save_trajectory",
-    "TrajectoryWriter",
-    "write_vtu_series",
-    "render",
-    "render_overlay",
-    "compare",
-    "converged",
-    "error_estimate",
-    "metrics",
-    "errors",
-    "figures",
-    "__version__",
-]
+__all__ = [*_HOME, *_MODULES, "__version__"]
 
 if TYPE_CHECKING:
-    from pdcorrect import errors, figures, metrics
-    from pdcorrect.batch.adjoint import BatchGradients
-    from pdcorrect.batch.layer import PDLayer
-    from pdcorrect.batch.stepper import BatchStepper
-    from pdcorrect.corrector.batch_hybrid import BatchHybrid, HybridLayer
-    from pdcorrect.corrector.corrector import Corrector
-    from pdcorrect.corrector.gate import Gate
-    from pdcorrect.corrector.hybrid import HybridStepper, hybrid_of
-    from pdcorrect.corrector.model_io import load_model, save_model
-    from pdcorrect.evaluation.compare import compare
-    from pdcorrect.evaluation.converged import converged, error_estimate
-    from pdcorrect.fem.modes import modes
-    from pdcorrect.fem.problem import Problem, coarse_model, discretise
-    from pdcorrect.fem.stress import stress
-    from pdcorrect.figures import render, render_overlay
-    from pdcorrect.io.trajectory import TrajectoryWriter, load_trajectory, save_trajectory
-    from pdcorrect.io.vtk import write_vtu_series
-    from pdcorrect.scene import Scene, best_coarse, learned_coarse
-    from pdcorrect.solvers.adjoint import adjoint
-    from pdcorrect.solvers.newton import Newton
-    from pdcorrect.solvers.projective import ProjectiveDynamics
-    from pdcorrect.solvers.reactions import reactions
-    from pdcorrect.solvers.rollout import march, restrict, rollout
-    from pdcorrect.state import State, Status, StepResult
-    from pdcorrect.trajectory import Stepper, Trajectory
+    from pdcorrect import errors as errors
+    from pdcorrect import figures as figures
+    from pdcorrect import metrics as metrics
+    from pdcorrect.batch.adjoint import BatchGradients as BatchGradients
+    from pdcorrect.batch.layer import PDLayer as PDLayer
+    from pdcorrect.batch.stepper import BatchStepper as BatchStepper
+    from pdcorrect.corrector.batch_hybrid import BatchHybrid as BatchHybrid
+    from pdcorrect.corrector.batch_hybrid import HybridLayer as HybridLayer
+    from pdcorrect.corrector.corrector import Corrector as Corrector
+    from pdcorrect.corrector.gate import Gate as Gate
+    from pdcorrect.corrector.hybrid import HybridStepper as HybridStepper
+    from pdcorrect.corrector.hybrid import hybrid_of as hybrid_of
+    from pdcorrect.corrector.model_io import load_model as load_model
+    from pdcorrect.corrector.model_io import save_model as save_model
+    from pdcorrect.evaluation.compare import compare as compare
+    from pdcorrect.evaluation.converged import converged as converged
+    from pdcorrect.evaluation.converged import error_estimate as error_estimate
+    from pdcorrect.fem.modes import modes as modes
+    from pdcorrect.fem.problem import Problem as Problem
+    from pdcorrect.fem.problem import coarse_model as coarse_model
+    from pdcorrect.fem.problem import discretise as discretise
+    from pdcorrect.fem.stress import stress as stress
+    from pdcorrect.figures import render as render
+    from pdcorrect.figures import render_overlay as render_overlay
+    from pdcorrect.io.trajectory import TrajectoryWriter as TrajectoryWriter
+    from pdcorrect.io.trajectory import load_trajectory as load_trajectory
+    from pdcorrect.io.trajectory import save_trajectory as save_trajectory
+    from pdcorrect.io.vtk import write_vtu_series as write_vtu_series
+    from pdcorrect.scene import Scene as Scene
+    from pdcorrect.scene import best_coarse as best_coarse
+    from pdcorrect.scene import learned_coarse as learned_coarse
+    from pdcorrect.solvers.adjoint import adjoint as adjoint
+    from pdcorrect.solvers.newton import Newton as Newton
+    from pdcorrect.solvers.projective import ProjectiveDynamics as ProjectiveDynamics
+    from pdcorrect.solvers.reactions import reactions as reactions
+    from pdcorrect.solvers.rollout import march as march
+    from pdcorrect.solvers.rollout import restrict as restrict
+    from pdcorrect.solvers.rollout import rollout as rollout
+    from pdcorrect.state import State as State
+    from pdcorrect.state import Status as Status
+    from pdcorrect.state import StepResult as StepResult
+    from pdcorrect.trajectory import Stepper as Stepper
+    from pdcorrect.trajectory import Trajectory as Trajectory
 
 
 def __getattr__(name: str) -> Any:

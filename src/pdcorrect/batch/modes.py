@@ -49,7 +49,7 @@ def relaxed(cells: CellBatch, positions: Tensor) -> Tensor:
 
 
 class Following:
-    """Modes that follow the nodes in equilibrium at y (B, U, 3), as `sensitivities.Following`."""
+    """Modes that follow the nodes in equilibrium at y (B, U, 3), as `Condensed` does."""
 
     def __init__(self, cells: CellBatch, y: Tensor) -> None:
         self._cells = cells

@@ -24,7 +24,7 @@ from torch import Tensor
 from pdcorrect.batch.cells import of_all, padded, places, table_rows
 from pdcorrect.batch.elimination import DenseInverse, Sharing, cellwise, summed_blocks
 from pdcorrect.batch.gpu import one_kernel, rows_of, sums
-from pdcorrect.fem.mesh import VTK_CORNERS
+from pdcorrect.fem.hexahedron import VTK_CORNERS
 from pdcorrect.fem.problem import Problem
 
 Array = NDArray[np.float64]

@@ -21,7 +21,7 @@ from pdcorrect.batch.decomposition import (
     transposed,
 )
 from pdcorrect.batch.triton_kernels import PointFunction, at_points
-from pdcorrect.fem.hyperelasticity import COROTATED, NEO_HOOKEAN
+from pdcorrect.fem.hyperelasticity import COROTATED, ENERGIES
 
 Tangent = tuple[Tensor, ...]
 """U (9, C, Q), V (9, C, Q) and the tangent (12, C, Q) in their frame; a batch of cells adds what
@@ -189,20 +189,9 @@ def principal_stress(
             density = density + 0.5 * omega * (g[0] * g[0] + g[1] * g[1] + g[2] * g[2])
             t = [a - omega * b for a, b in zip(t, g, strict=True)]
         return density, t
-    lam = omega / 3.0
-    if model == NEO_HOOKEAN:
-        pairs = e[0] * e[1] + e[1] * e[2] + e[2] * e[0]
-        triple = e[0] * e[1] * e[2]
-        change = e[0] + e[1] + e[2] + pairs + triple
-        rest = 0.5 * (e[0] * e[0] + e[1] * e[1] + e[2] * e[2]) - pairs - triple
-        density = mu * rest + 0.5 * (mu + lam) * change * change
-        q = (mu + lam) * change - mu
-        t = [mu * s[i] + q * s[(i + 1) % 3] * s[(i + 2) % 3] for i in range(3)]
-        return density, t
-    x = [a + 0.5 * a * a for a in e]
-    trace = x[0] + x[1] + x[2]
-    density = mu * (x[0] * x[0] + x[1] * x[1] + x[2] * x[2]) + 0.5 * lam * trace * trace
-    return density, [a * (2.0 * mu * b + lam * trace) for a, b in zip(s, x, strict=True)]
+    stress, _ = ENERGIES[model]
+    density, t = stress(s, mu, omega / 3.0)
+    return density, list(t)
 
 
 def principal_tangent(
@@ -218,7 +207,11 @@ def principal_tangent(
     The diagonal block 00 11 22 01 02 12; then for the pairs 01 02 12 the factors p and m
     of P_ij = p F_ij + m F_ji.
     """
-    T = _corotated(s, nearest, mu, omega) if model == COROTATED else _other(model, s, mu, omega)
+    if model == COROTATED:
+        T = _corotated(s, nearest, mu, omega)
+    else:
+        _, tangent = ENERGIES[model]
+        T = list(tangent(s, mu, omega / 3.0))
     if project:
         T = [*positive_part(T[:6]), *(torch.clamp(x, min=0.0) for x in T[6:])]
     for pair in range(3):
@@ -258,32 +251,6 @@ def _corotated(s: list[Tensor], nearest: Nearest, mu: Tensor, omega: Tensor) -> 
         more = omega * k / torch.where(plus, vv + k, 1.0)
         T[6 + pair] = T[6 + pair] + torch.where(plus, more, zero)
     return T
-
-
-def _other(model: int, s: list[Tensor], mu: Tensor, omega: Tensor) -> list[Tensor]:
-    lam = omega / 3.0
-    change = s[0] * s[1] * s[2] - 1.0
-    trace = 0.5 * (s[0] * s[0] + s[1] * s[1] + s[2] * s[2] - 3.0)
-    q = (mu + lam) * change - mu
-    diagonal, off, symmetric, antisymmetric = [], [], [], []
-    for i in range(3):
-        x, y, z = s[i], s[(i + 1) % 3], s[(i + 2) % 3]
-        if model == NEO_HOOKEAN:
-            diagonal.append(mu + (mu + lam) * y * y * z * z)
-        else:
-            diagonal.append(mu * (3.0 * x * x - 1.0) + lam * (x * x + trace))
-    for a, b in _PAIRS:
-        x, y, z = s[a], s[b], s[3 - a - b]
-        if model == NEO_HOOKEAN:
-            off.append((mu + lam) * x * y * z * z + q * z)
-            symmetric.append(mu - q * z)
-            antisymmetric.append(mu + q * z)
-        else:
-            both = x * x + y * y - 1.0
-            off.append(lam * x * y)
-            symmetric.append(lam * trace + mu * (both + x * y))
-            antisymmetric.append(lam * trace + mu * (both - x * y))
-    return [*diagonal, *off, *symmetric, *antisymmetric]
 
 
 def tangent_product(

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from pdcorrect.elements.bodies import Grid, VoxelBody, nodes_of
 from pdcorrect.fem.assembly import Assembly, summed_cells
 from pdcorrect.fem.factorisation import factorise
-from pdcorrect.fem.mesh import VTK_CORNERS
+from pdcorrect.fem.hexahedron import VTK_CORNERS
 from pdcorrect.fem.problem import discretise
 from pdcorrect.scene import Scene
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import SupportsInt
 
 import numpy as np
 import scipy.ndimage as ndi
@@ -128,7 +130,7 @@ def _holed(rng: np.random.Generator) -> Grid:
     for _ in range(rng.integers(1, 4)):
         size = np.minimum(rng.integers(1, 3, size=3), np.array(solid.shape) - 1)
         start = [rng.integers(0, n - s + 1) for n, s in zip(solid.shape, size, strict=True)]
-        solid[tuple(slice(i, i + s) for i, s in zip(start, size, strict=True))] = False
+        solid[box(start, np.add(start, size))] = False
     return solid
 
 
@@ -175,12 +177,17 @@ _SHAPES = {
 }
 
 
+def box(low: Iterable[SupportsInt], high: Iterable[SupportsInt]) -> tuple[slice, ...]:
+    """The part of a grid from one place up to another, which is not in it."""
+    return tuple(slice(int(a), int(b)) for a, b in zip(low, high, strict=True))
+
+
 def _box(rng: np.random.Generator, shape: tuple[int, ...]) -> tuple[slice, ...]:
     drawn = [rng.integers(1, n + 1) if i == 0 else rng.integers(1, 4) for i, n in enumerate(shape)]
     size = [int(n) for n in rng.permutation(drawn)]
     size = [min(s, n) for s, n in zip(size, shape, strict=True)]
     start = [rng.integers(0, n - s + 1) for n, s in zip(shape, size, strict=True)]
-    return tuple(slice(i, i + s) for i, s in zip(start, size, strict=True))
+    return box(start, np.add(start, size))
 
 
 def connected(solid: Grid, start: tuple[int, ...] | None = None) -> Grid:
@@ -193,8 +200,7 @@ def connected(solid: Grid, start: tuple[int, ...] | None = None) -> Grid:
 
 def _trimmed(solid: Grid) -> Grid:
     found = np.argwhere(solid)
-    low, high = found.min(axis=0), found.max(axis=0) + 1
-    return solid[tuple(slice(a, b) for a, b in zip(low, high, strict=True))]
+    return solid[box(found.min(axis=0), found.max(axis=0) + 1)]
 
 
 # --- held nodes and materials --------------------------------------------------------------------

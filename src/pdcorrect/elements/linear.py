@@ -13,8 +13,8 @@ from torch import Tensor
 
 from pdcorrect.elements.answers import Answers
 from pdcorrect.fem.cell_correction import cell_shapes
+from pdcorrect.fem.hexahedron import VTK_CORNERS
 from pdcorrect.fem.learned import BOUND, own_mass, own_stiffness, root, scalar_map, strain_map
-from pdcorrect.fem.mesh import VTK_CORNERS
 from pdcorrect.fem.neighbourhood import cell_graph, neighbours_of
 
 Array = NDArray[np.float64]

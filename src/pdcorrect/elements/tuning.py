@@ -9,13 +9,12 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from safetensors.torch import load
 
 from pdcorrect._environment import environment
 from pdcorrect._files import make_folder, write_text
 from pdcorrect.elements.answers import answers
-from pdcorrect.elements.bodies import Grid, VoxelBody, connected, holds, nodes_of
+from pdcorrect.elements.bodies import Grid, VoxelBody, box, connected, holds, nodes_of
 from pdcorrect.elements.linear import Batch, Errors, collate, errors, loss, means, sample
 from pdcorrect.elements.network import Descent, ElementNetwork
 from pdcorrect.errors import ConvergenceError, InputError
@@ -172,24 +171,20 @@ def part(body: VoxelBody, rng: np.random.Generator) -> VoxelBody:
             a, b = low.copy(), high.copy()
             a[axis], b[axis] = a[axis] - (1 - side), b[axis] + side
             inside = a[axis] >= 0 and b[axis] <= body.solid.shape[axis]
-            if inside and body.solid[_box(a, b)].sum() <= _CELLS:
+            if inside and body.solid[box(a, b)].sum() <= _CELLS:
                 grown.append((a, b))
         if not grown:
             break
         low, high = grown[rng.integers(len(grown))]
-    box = _box(low, high)
-    solid = connected(body.solid[box], tuple(start - low))
+    inside = box(low, high)
+    solid = connected(body.solid[inside], tuple(start - low))
     nodes = nodes_of(solid)
-    held: Grid = body.held[_box(low, high + 1)] & nodes
+    held: Grid = body.held[box(low, high + 1)] & nodes
     while body.held.any() and not holds(held, nodes):
         region = np.zeros_like(nodes)
         np.moveaxis(region, int(rng.integers(3)), 0)[-int(rng.integers(2))] = True
         held = region & nodes
-    return VoxelBody("part", solid, held, body.young[box], body.density[box], body.poisson)
-
-
-def _box(low: NDArray[np.int64], high: NDArray[np.int64]) -> tuple[slice, ...]:
-    return tuple(slice(int(a), int(b)) for a, b in zip(low, high, strict=True))
+    return VoxelBody("part", solid, held, body.young[inside], body.density[inside], body.poisson)
 
 
 def _network(path: Path) -> ElementNetwork:

@@ -44,19 +44,22 @@ class Assembly:
     @cached_property
     def _pattern(self) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int64]]:
         """Block rows and columns, and the place of each cell's node pair among them."""
-        width = self.cells.shape[1]
-        rows = np.repeat(self.cells, width, axis=1).ravel()
-        columns = np.tile(self.cells, width).ravel()
+        rows, columns = node_pairs(self.cells)
         keys, place = np.unique(rows * self._count + columns, return_inverse=True)
         indptr = np.searchsorted(keys, np.arange(self._count + 1) * self._count)
         return indptr.astype(np.int32), (keys % self._count).astype(np.int32), place.ravel()
 
 
+def node_pairs(cells: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Rows and columns of the entries of the cells' matrices (C, K, K), raveled."""
+    width = cells.shape[1]
+    return np.repeat(cells, width, axis=1).ravel(), np.tile(cells, width).ravel()
+
+
 def summed_cells(cells: NDArray[np.int64], blocks: Array, count: int) -> sp.csr_matrix:
     """Matrices of the cells (C, K, K) summed into (count, count)."""
-    width = cells.shape[1]
-    rows, columns = np.repeat(cells, width, axis=1).ravel(), np.tile(cells, width).ravel()
-    return sp.csr_matrix(sp.coo_matrix((blocks.ravel(), (rows, columns)), shape=(count, count)))
+    entries = blocks.ravel(), node_pairs(cells)
+    return sp.csr_matrix(sp.coo_matrix(entries, shape=(count, count)))
 
 
 def scatter(cells: NDArray[np.int64], values: Array, count: int) -> Array:

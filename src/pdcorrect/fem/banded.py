@@ -16,6 +16,7 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
+from pdcorrect.fem.assembly import node_pairs
 from pdcorrect.fem.decomposition import OPTIONS
 from pdcorrect.fem.factorisation import NotPositiveDefinite
 
@@ -49,16 +50,13 @@ class BandOrder:
         """Multiplications and additions of a factorisation."""
         return float(self.rows) * self.bandwidth**2
 
-    def assemble(self, blocks: Array, mass: sp.csr_matrix, mass_factor: float) -> Array:
-        """Cell blocks (C, K, K, 3, 3) plus ``mass_factor`` times the mass matrix, (n, b + 1).
+    def assemble(self, blocks: Array) -> Array:
+        """The sum of cell blocks (C, K, K, 3, 3), as (n, b + 1).
 
         Row j holds the entries (j, j), (j + 1, j), ... of the lower triangle.
         """
         band = np.zeros((self.rows, self.bandwidth + 1))
         _add_blocks(self.number, self._cells, blocks, band)
-        if mass_factor:
-            entries = mass.tocoo()
-            _add_scalar(self.number, entries.row, entries.col, mass_factor * entries.data, band)
         return band
 
     def factorise(self, band: Array) -> BandFactor:
@@ -94,9 +92,8 @@ class BandFactor:
 
 
 def _candidates(positions: Array, cells: Index) -> Iterator[Index]:
-    count, width = len(positions), cells.shape[1]
-    rows, columns = np.repeat(cells, width, axis=1).ravel(), np.tile(cells, width).ravel()
-    graph = sp.csr_matrix((np.ones(len(rows), dtype=np.int8), (rows, columns)), (count, count))
+    pairs = node_pairs(cells)
+    graph = sp.csr_matrix((np.ones(len(pairs[0]), dtype=np.int8), pairs), 2 * (len(positions),))
     yield reverse_cuthill_mckee(graph, symmetric_mode=True).astype(np.int64)
     edge = np.ptp(positions[cells], axis=1).min()
     grid = np.round(positions / (1e-3 * edge)).T
@@ -128,12 +125,3 @@ def _add_blocks(number, cells, blocks, band):  # type: ignore[no-untyped-def]
                         j = number[cells[c, l], b]
                         if i >= j >= 0:
                             band[j, i - j] += blocks[c, k, l, a, b]
-
-
-@njit(**OPTIONS)
-def _add_scalar(number, rows, columns, values, band):  # type: ignore[no-untyped-def]
-    for n in range(len(values)):
-        for a in range(3):
-            i, j = number[rows[n], a], number[columns[n], a]
-            if i >= j >= 0:
-                band[j, i - j] += values[n]

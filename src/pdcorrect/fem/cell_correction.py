@@ -14,6 +14,7 @@ from pdcorrect.fem import turned_strains
 from pdcorrect.fem.assembly import Assembly
 from pdcorrect.fem.cube_symmetry import PATTERNS
 from pdcorrect.fem.hexahedron import VTK_CORNERS, shape_derivatives
+from pdcorrect.fem.kernels import gather_nodes
 from pdcorrect.fem.operators import freeze
 from pdcorrect.fem.turned_strains import SHARES
 
@@ -34,7 +35,7 @@ class Writer(Protocol):
         """Those of a body."""
 
     def slopes(
-        self, mu: Array, omega: Array, by_matrices: Array | None, by_masses: Array | None
+        self, mu: Array, omega: Array, by_matrices: Array, by_masses: Array
     ) -> tuple[Array, Array]:
         """Derivatives by both weights, from those by a correction's matrices and masses."""
 
@@ -179,7 +180,7 @@ class CellCorrection:
         """Summed at the nodes; zero for what else u has."""
         out = np.empty_like(u)
         assembly = self.assembly
-        turned_strains.gather_nodes(
+        gather_nodes(
             assembly.start, assembly.slots, by_cell.reshape(-1, 3), out[: len(assembly.start) - 1]
         )
         out[len(assembly.start) - 1 :] = 0.0

@@ -20,6 +20,7 @@ from pdcorrect.fem import internal_modes, kernels
 from pdcorrect.fem.assembly import Assembly, summed_cells
 from pdcorrect.fem.cell_correction import CellCorrection, CorrectionTangent
 from pdcorrect.fem.hexahedron import corner_jacobians
+from pdcorrect.fem.internal_modes import Condensed
 from pdcorrect.fem.materials import Materials
 from pdcorrect.fem.mesh import HexMesh
 from pdcorrect.fem.operators import Space
@@ -59,10 +60,6 @@ class Linearisation:
             np.empty((*assembly.cells.shape, 3)), assembly.start, assembly.slots, out,
         )  # fmt: skip
         return out if self.correction is None else out + self.correction.apply(x)
-
-    def assemble(self) -> sp.csr_matrix:
-        """The tangent as a sparse matrix (3N, 3N), N/m."""
-        return self.assembly.matrix(self.blocks())
 
     def blocks(self) -> Array:
         """The tangent of each cell, (C, L, L, 3, 3), N/m."""
@@ -167,19 +164,25 @@ class ElasticBody:
 
         ``project`` raises negative eigenvalues to zero at each quadrature point.
         """
-        tangent = self.linearise(self.relaxed(positions), project)
-        if not self.space.internal:
-            return tangent.assemble()
+        return self.nodal_assembly.matrix(self.condensed(self.relaxed(positions), project).blocks)
+
+    def condensed(self, configuration: Array, project: bool = False) -> Condensed:
+        """The tangent with internal modes that follow the nodes, in equilibrium.
+
+        `ConvergenceError` is raised where that is not stable.
+        """
+        blocks = self.linearise(configuration, project).blocks()
         try:
-            modes = internal_modes.Condensed(
-                tangent.blocks(), self.space.local, self.cells.shape[1]
-            )
+            return Condensed(blocks, self.space.local, self.cells.shape[1])
         except np.linalg.LinAlgError:
             raise ConvergenceError(
-                "the internal modes of a cell are not in stable equilibrium at these positions: "
-                "expected a shape that is strained less. Use project=True."
+                "the internal modes of a cell are not in stable equilibrium: expected a state "
+                "that a step converged to, or a shape that is strained less. Use project=True."
             ) from None
-        return Assembly(self.cells, len(self.positions)).matrix(modes.blocks)
+
+    def lifted(self, configuration: Array, nodal: Array) -> Array:
+        """A change of the nodes (N, 3) with that of the modes, in equilibrium, (N + B, 3)."""
+        return self.condensed(configuration).lifted(nodal) if self.space.internal else nodal
 
     def energy_and_forces(self, configuration: Array) -> tuple[float, Array]:
         """Elastic energy (J) and forces (N + B, 3) (N), from one pass over the cells."""
@@ -270,6 +273,13 @@ class ElasticBody:
     def assembly(self) -> Assembly:
         """Sums cell-wise results into configurations."""
         return Assembly(self.space.local, self.unknowns)
+
+    @cached_property
+    def nodal_assembly(self) -> Assembly:
+        """Sums cell-wise results at the nodes."""
+        if not self.space.internal:
+            return self.assembly
+        return Assembly(self.cells, len(self.positions))
 
     @cached_property
     def point_weights(self) -> Array:

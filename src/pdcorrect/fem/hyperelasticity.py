@@ -16,9 +16,16 @@ isotropic tangent is one 3x3 block for the diagonal and, for each pair i, j with
 principal stresses t, the modes (t_i - t_j)/(s_i - s_j) and (t_i + t_j)/(s_i + s_j)
 (Stomakhin et al. 2012).  Both quotients are polynomials here, so nothing special
 happens at repeated or opposite stretches.
+
+The functions in `ENERGIES` are of numbers, for the kernels, and of tensors, for batches: stretches
+(3), mu and lambda to the density and the principal stresses (3), and to the tangent (12) with rows
+as in `corotated_tangent_lanes`.
 """
 
 from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
 
 from numba import njit
 
@@ -50,55 +57,83 @@ def model_name(code: int) -> str:
     return next(name for name, known in _CODES.items() if known == code)
 
 
+def neo_hookean(s, mu, lam):  # type: ignore[no-untyped-def]
+    a, b, c = s
+    x, y, z = a - 1.0, b - 1.0, c - 1.0  # near rest sums of a, b, c would cancel
+    pairs, triple = x * y + y * z + z * x, x * y * z
+    change = x + y + z + pairs + triple
+    rest = 0.5 * (x * x + y * y + z * z) - pairs - triple
+    q = (mu + lam) * change - mu
+    density = mu * rest + 0.5 * (mu + lam) * change * change
+    return density, (mu * a + q * b * c, mu * b + q * a * c, mu * c + q * a * b)
+
+
+def neo_hookean_tangent(s, mu, lam):  # type: ignore[no-untyped-def]
+    a, b, c = s
+    both = mu + lam
+    q = both * (a * b * c - 1.0) - mu
+    return (
+        mu + both * b * b * c * c, mu + both * c * c * a * a, mu + both * a * a * b * b,
+        both * a * b * c * c + q * c, both * a * c * b * b + q * b, both * b * c * a * a + q * a,
+        mu - q * c, mu - q * b, mu - q * a,
+        mu + q * c, mu + q * b, mu + q * a,
+    )  # fmt: skip
+
+
+def st_venant_kirchhoff(s, mu, lam):  # type: ignore[no-untyped-def]
+    a, b, c = s
+    x, y, z = a - 1.0, b - 1.0, c - 1.0
+    x, y, z = x + 0.5 * x * x, y + 0.5 * y * y, z + 0.5 * z * z
+    pressure = lam * (x + y + z)
+    density = mu * (x * x + y * y + z * z) + 0.5 * pressure * (x + y + z)
+    twice = 2.0 * mu
+    return density, (
+        a * (twice * x + pressure), b * (twice * y + pressure), c * (twice * z + pressure),
+    )  # fmt: skip
+
+
+def st_venant_kirchhoff_tangent(s, mu, lam):  # type: ignore[no-untyped-def]
+    a, b, c = s
+    aa, bb, cc = a * a, b * b, c * c
+    pressure = 0.5 * lam * (aa + bb + cc - 3.0)
+    rest = pressure - mu
+    return (
+        rest + (3.0 * mu + lam) * aa, rest + (3.0 * mu + lam) * bb, rest + (3.0 * mu + lam) * cc,
+        lam * a * b, lam * a * c, lam * b * c,
+        rest + mu * (aa + bb + a * b), rest + mu * (aa + cc + a * c), rest + mu * (bb + cc + b * c),
+        rest + mu * (aa + bb - a * b), rest + mu * (aa + cc - a * c), rest + mu * (bb + cc - b * c),
+    )  # fmt: skip
+
+
+ENERGIES: dict[int, tuple[Callable[..., Any], Callable[..., Any]]] = {
+    NEO_HOOKEAN: (neo_hookean, neo_hookean_tangent),
+    ST_VENANT_KIRCHHOFF: (st_venant_kirchhoff, st_venant_kirchhoff_tangent),
+}
+(_neo, _neo_tangent), (_venant, _venant_tangent) = (
+    [njit(**OPTIONS)(function) for function in functions] for functions in ENERGIES.values()
+)
+
+
 @njit(**OPTIONS)
 def hyperelastic_lanes(model, s, mu, omega, density, t):  # type: ignore[no-untyped-def]
     """Energy density (L,) and principal stresses t (3, L) for stretches s (3, L)."""
     for l in range(s.shape[1]):
-        a, b, c = s[0, l], s[1, l], s[2, l]
-        lam = omega[l] / 3.0
+        stretches, lam = (s[0, l], s[1, l], s[2, l]), omega[l] / 3.0
         if model == NEO_HOOKEAN:
-            x, y, z = a - 1.0, b - 1.0, c - 1.0  # near rest sums of a, b, c would cancel
-            pairs, triple = x * y + y * z + z * x, x * y * z
-            change = x + y + z + pairs + triple
-            rest = 0.5 * (x * x + y * y + z * z) - pairs - triple
-            density[l] = mu[l] * rest + 0.5 * (mu[l] + lam) * change * change
-            q = (mu[l] + lam) * change - mu[l]
-            t[0, l] = mu[l] * a + q * b * c
-            t[1, l] = mu[l] * b + q * a * c
-            t[2, l] = mu[l] * c + q * a * b
+            density[l], stress = _neo(stretches, mu[l], lam)
         else:
-            x, y, z = a - 1.0, b - 1.0, c - 1.0
-            x, y, z = x + 0.5 * x * x, y + 0.5 * y * y, z + 0.5 * z * z
-            trace = x + y + z
-            density[l] = mu[l] * (x * x + y * y + z * z) + 0.5 * lam * trace * trace
-            t[0, l] = a * (2.0 * mu[l] * x + lam * trace)
-            t[1, l] = b * (2.0 * mu[l] * y + lam * trace)
-            t[2, l] = c * (2.0 * mu[l] * z + lam * trace)
+            density[l], stress = _venant(stretches, mu[l], lam)
+        t[0, l], t[1, l], t[2, l] = stress
 
 
 @njit(**OPTIONS)
 def hyperelastic_tangent_lanes(model, s, mu, omega, T):  # type: ignore[no-untyped-def]
     """Tangent T (12, L), rows as in `corotated_tangent_lanes`."""
     for l in range(s.shape[1]):
-        lam = omega[l] / 3.0
-        change = s[0, l] * s[1, l] * s[2, l] - 1.0
-        trace = 0.5 * (s[0, l] * s[0, l] + s[1, l] * s[1, l] + s[2, l] * s[2, l] - 3.0)
-        q = (mu[l] + lam) * change - mu[l]
-        for i in range(3):
-            x, y, z = s[i, l], s[(i + 1) % 3, l], s[(i + 2) % 3, l]
-            if model == NEO_HOOKEAN:
-                T[i, l] = mu[l] + (mu[l] + lam) * y * y * z * z
-            else:
-                T[i, l] = mu[l] * (3.0 * x * x - 1.0) + lam * (x * x + trace)
-        for pair in range(3):
-            i, j, k = pair // 2, 1 + (pair + 1) // 2, 2 - pair
-            x, y, z = s[i, l], s[j, l], s[k, l]
-            if model == NEO_HOOKEAN:
-                T[3 + pair, l] = (mu[l] + lam) * x * y * z * z + q * z
-                T[6 + pair, l] = mu[l] - q * z
-                T[9 + pair, l] = mu[l] + q * z
-            else:
-                both = x * x + y * y - 1.0
-                T[3 + pair, l] = lam * x * y
-                T[6 + pair, l] = lam * trace + mu[l] * (both + x * y)
-                T[9 + pair, l] = lam * trace + mu[l] * (both - x * y)
+        stretches, lam = (s[0, l], s[1, l], s[2, l]), omega[l] / 3.0
+        if model == NEO_HOOKEAN:
+            tangent = _neo_tangent(stretches, mu[l], lam)
+        else:
+            tangent = _venant_tangent(stretches, mu[l], lam)
+        for i in range(12):
+            T[i, l] = tangent[i]

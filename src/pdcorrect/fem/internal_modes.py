@@ -192,23 +192,29 @@ class Condensed:
     ) -> None:
         count, width = blocks.shape[:2]
         m = 3 * (width - nodes)
+        self._nodes, self._modes = local[:, :nodes], local[:, nodes:]
+        self.size, self.blocks = self._modes.size, blocks
+        if not self.size:
+            return
         self.blocks = np.empty((count, nodes, nodes, 3, 3))
         self._inverse = np.empty((count, m, m))
         self._solved = np.empty((count, m, 3 * nodes))
         if not _eliminate(blocks, nodes, shift, self.blocks, self._inverse, self._solved):
             raise np.linalg.LinAlgError("the modes of a cell have an indefinite tangent")
-        self._nodes, self._modes = local[:, :nodes], local[:, nodes:]
-        self.size = self._modes.size
 
     def reduced(self, r: Array) -> Array:
         """Right-hand side (N, 3) of the nodes for that of a configuration, (N + B, 3)."""
-        count = len(r) - self._modes.size
+        if not self.size:
+            return r
+        count = len(r) - self.size
         modes = r[self._modes].reshape(len(self._modes), -1, 1)
         moved = (self._solved.transpose(0, 2, 1) @ modes).reshape(*self._nodes.shape, 3)
         return r[:count] - scatter(self._nodes, moved, count)
 
     def recovered(self, nodal: Array, r: Array) -> Array:
         """The whole solution (N + B, 3) for that of the nodes (N, 3) and right-hand side r."""
+        if not self.size:
+            return nodal
         modes = r[self._modes].reshape(len(self._modes), -1, 1)
         values = nodal[self._nodes].reshape(len(self._nodes), -1, 1)
         found = self._inverse @ modes - self._solved @ values
@@ -216,3 +222,11 @@ class Condensed:
         out[: len(nodal)] = nodal
         out[self._modes] = found.reshape(*self._modes.shape, 3)
         return out
+
+    def lifted(self, nodal: Array) -> Array:
+        """The configuration's change (N + B, 3) for a change of the nodes (N, 3)."""
+        return self.recovered(nodal, np.zeros((len(nodal) + self.size, 3)))
+
+    def response(self, r: Array) -> Array:
+        """The modes' change (N + B, 3) with nodes held, by forces r (N + B, 3)."""
+        return self.recovered(np.zeros((len(r) - self.size, 3)), r)

@@ -152,19 +152,20 @@ class ElementWriter:
         )
 
     def slopes(
-        self, mu: Array, omega: Array, by_matrices: Array | None, by_masses: Array | None
+        self, mu: Array, omega: Array, by_matrices: Array, by_masses: Array
     ) -> tuple[Array, Array]:
         """Derivatives by mu and omega, each (C,), from those by K (C, 18, 18) and the masses.
 
-        None is zero.  What cells have of their own is differentiated by differences, the
-        network's answers by the chain rule.
+        What cells have of their own is differentiated by differences, the network's answers by
+        the chain rule.
         """
         young, poisson = effective_moduli(mu, omega)
         graph, learned = self._seen(young, poisson)
         nothing = np.zeros(len(learned))
         if not learned.any():
             return nothing, nothing
-        G, J = self._in_order(by_matrices, by_masses, learned)
+        order, cell = self._grid.order, np.arange(len(learned))[:, None, None]
+        G, J = by_matrices[learned], by_masses[cell, order[:, :, None], order[:, None]][learned]
         N, H = self._answers(graph, learned)
         S, R = bounded(N), bounded(H)
 
@@ -196,19 +197,6 @@ class ElementWriter:
         for which, moved in enumerate(_moduli_slopes(mu, omega)):
             found[which] = found[which] + by_young * moved[0] + by_poisson * moved[1]
         return found[0], found[1]
-
-    def _in_order(
-        self, by_matrices: Array | None, by_masses: Array | None, learned: NDArray[np.bool_]
-    ) -> tuple[Array, Array]:
-        """Those of the learned cells, with corners in the grid's order."""
-        order, count = self._grid.order, len(learned)
-        if by_matrices is None:
-            by_matrices = np.zeros((count, STRAINS, STRAINS))
-        if by_masses is None:
-            by_masses = np.zeros((count, 8, 8))
-        cell = np.arange(count)[:, None, None]
-        by_masses = by_masses[cell, order[:, :, None], order[:, None, :]]
-        return by_matrices[learned], by_masses[learned]
 
     def unlike(self, mu: Array, omega: Array) -> dict[str, int]:
         """How many cells the network was not trained for, by what they are."""
@@ -279,8 +267,6 @@ def rest_stiffness(body: ElasticBody, mu: Array, omega: Array, few: NDArray[np.i
     materials = replace(body.materials, mu=mu, volume_weight=omega)
     plain = ElasticBody(body.mesh, body.space, body.quadrature, materials, body.cell_size)
     blocks = plain.linearise(plain.extended(plain.positions)).blocks()[few]
-    if not plain.space.internal:
-        return blocks
     return Condensed(blocks, plain.space.local[few], plain.cells.shape[1]).blocks
 
 

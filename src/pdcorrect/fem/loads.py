@@ -188,21 +188,22 @@ class _Pressure:
     nodes: NDArray[np.int64]
 
     def sample(self, positions: Array) -> Array:
-        face = self.face
-        F = np.einsum("nki,nqkj->nqij", positions[self.nodes], face.gradients)
+        face, F = self.face, self._deformation(positions)
         area = np.einsum("nqij,nqj->nqi", cofactor(F), face.normals)
         values = np.einsum("nq,nqk,nqi->nki", face.weights, face.values, -self.pressure * area)
         return scatter(self.nodes, values, len(positions))
 
     def pull(self, positions: Array, x: Array) -> Array:
-        face = self.face
-        F = np.einsum("nki,nqkj->nqij", positions[self.nodes], face.gradients)
+        face, F = self.face, self._deformation(positions)
         at_points = -self.pressure * np.einsum(
             "nq,nqk,nki->nqi", face.weights, face.values, x[self.nodes]
         )
         slope = tensor_cross(F, at_points[..., :, None] * face.normals[..., None, :])
         values = np.einsum("nqij,nqkj->nki", slope, face.gradients)
         return scatter(self.nodes, values, len(positions))
+
+    def _deformation(self, positions: Array) -> Array:
+        return np.einsum("nki,nqkj->nqij", positions[self.nodes], self.face.gradients)
 
 
 def _pressure(load: Pressure, space: Space, selector: Selector, mass: Array, key: str) -> Sampler:
@@ -212,67 +213,57 @@ def _pressure(load: Pressure, space: Space, selector: Selector, mass: Array, key
 
 
 @dataclass(frozen=True, eq=False)
-class _TorsionField:
-    """The field at points, N/m3 or N."""
+class _Torsion:
+    """The field at some ``nodes``, or integrated over cells, ``inside`` (C, 1, 1) being 1 there."""
 
     load: Torsion
     centre: Array
-
-    def __call__(self, points: Array) -> Array:
-        about, load = points - self.centre, self.load
-        return load.strength * torsion_field(about, load.attraction, load.stretch)
-
-    def pull(self, points: Array, x: Array) -> Array:
-        about, load = points - self.centre, self.load
-        return load.strength * torsion_pull(about, load.attraction, load.stretch, x)
-
-
-@dataclass(frozen=True, eq=False)
-class _NodalTorsion:
-    """The field at some nodes."""
-
-    field: _TorsionField
-    nodes: NDArray[np.int64]
-
-    def sample(self, positions: Array) -> Array:
-        out = np.zeros_like(positions)
-        out[self.nodes] = self.field(positions[self.nodes])
-        return out
-
-    def pull(self, positions: Array, x: Array) -> Array:
-        out = np.zeros_like(positions)
-        out[self.nodes] = self.field.pull(positions[self.nodes], x[self.nodes])
-        return out
-
-
-@dataclass(frozen=True, eq=False)
-class _CellTorsion:
-    """The field integrated over cells, ``inside`` (C, 1, 1) being 1 there."""
-
-    field: _TorsionField
     space: Space
-    inside: Array
+    nodes: NDArray[np.int64] | None
+    inside: Array | None
 
     def sample(self, positions: Array) -> Array:
-        at_rest = positions is self.space.positions
-        points = self.space.points if at_rest else self.space.interpolate(positions)
-        return self.space.body_load(self.field(points) * self.inside)
+        return self._spread(self.load.strength * torsion_field(*self._field(positions)))
 
     def pull(self, positions: Array, x: Array) -> Array:
-        space = self.space
-        forces = space.body_load_transposed(x) * self.inside
-        return space.interpolate_transposed(self.field.pull(space.interpolate(positions), forces))
+        if self.inside is None:
+            along = x[self.nodes]
+        else:
+            along = self.space.body_load_transposed(x) * self.inside
+        slopes = self.load.strength * torsion_pull(*self._field(positions), along)
+        if self.inside is None:
+            return self._spread(slopes)
+        return self.space.interpolate_transposed(slopes)
+
+    def _field(self, positions: Array) -> tuple[Array, float, float]:
+        """Points from the centre, where the field is, and its two shares."""
+        if self.nodes is not None:
+            points = positions[self.nodes]
+        elif positions is self.space.positions:
+            points = self.space.points
+        else:
+            points = self.space.interpolate(positions)
+        return points - self.centre, self.load.attraction, self.load.stretch
+
+    def _spread(self, field: Array) -> Array:
+        if self.inside is not None:
+            return self.space.body_load(field * self.inside)
+        out = np.zeros_like(self.space.positions)
+        out[self.nodes] = field
+        return out
 
 
 def _torsion(load: Torsion, space: Space, selector: Selector, mass: Array, key: str) -> Sampler:
     rest = space.positions
     middle = 0.5 * (rest.min(axis=0) + rest.max(axis=0))
-    field = _TorsionField(load, middle if load.centre is None else np.array(load.centre))
+    centre = middle if load.centre is None else np.array(load.centre)
+    nodes = inside = None
     if load.distribution == "nodal":
-        nodal = _NodalTorsion(field, selector.coarse_nodes(load.region, key))
-        return nodal.sample, nodal.pull
-    spread = _CellTorsion(field, space, _inside(space, selector.cells(load.region, key)))
-    return spread.sample, spread.pull
+        nodes = selector.coarse_nodes(load.region, key)
+    else:
+        inside = _inside(space, selector.cells(load.region, key))
+    field = _Torsion(load, centre, space, nodes, inside)
+    return field.sample, field.pull
 
 
 _SAMPLERS: dict[type, Callable[..., Sampler]] = {

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from pdcorrect.errors import MeshError, PdcorrectWarning
-from pdcorrect.fem.hexahedron import VTK_CORNERS, VTK_EDGES, VTK_FACES, corner_jacobians
+from pdcorrect.fem.hexahedron import VTK_CORNERS
 from pdcorrect.fem.mesh_checks import (
     check_arrays,
     check_cells,
@@ -27,19 +27,6 @@ from pdcorrect.fem.mesh_checks import (
     face_groups,
     row_groups,
 )
-
-__all__ = [
-    "VTK_CORNERS",
-    "VTK_EDGES",
-    "VTK_FACES",
-    "Group",
-    "HexMesh",
-    "boundary_faces",
-    "coincident_nodes",
-    "corner_jacobians",
-    "refine",
-    "voxel_mesh",
-]
 
 
 class Group(NamedTuple):
@@ -186,14 +173,6 @@ def refine(mesh: HexMesh, k: int) -> HexMesh:
         {name: group.refined(weights, k) for name, group in mesh.groups.items()},
         weights if mesh.from_coarse is None else sp.csr_matrix(weights @ mesh.from_coarse),
     )
-
-
-def interpolation(mesh: HexMesh, k: int) -> sp.csr_matrix:
-    """Trilinear interpolation from a mesh's nodes to those of ``refine(mesh, k)``, (N, N_c)."""
-    if k == 1:
-        return sp.eye_array(len(mesh.positions)).tocsr()
-    corner, weight, _ = _lattice(mesh, k)
-    return _interpolation(mesh, corner, weight, k)
 
 
 def _interpolation(

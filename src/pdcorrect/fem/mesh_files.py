@@ -15,7 +15,8 @@ from pdcorrect._files import replacing
 from pdcorrect.errors import MeshError, OutputError
 from pdcorrect.fem.abaqus_files import read_abaqus
 from pdcorrect.fem.gmsh_files import read_gmsh
-from pdcorrect.fem.mesh import VTK_EDGES, VTK_FACES, Group, HexMesh
+from pdcorrect.fem.hexahedron import VTK_EDGES, VTK_FACES
+from pdcorrect.fem.mesh import Group, HexMesh
 from pdcorrect.fem.mesh_checks import TOLERANCE, row_groups
 from pdcorrect.fem.mesh_content import Block, Content, Integers
 from pdcorrect.fem.vtk_files import read_meshio, read_vtk

@@ -17,8 +17,7 @@ from skfem.element import DiscreteField, Element
 from skfem.mapping import MappingIsoparametric
 from skfem.quadrature import get_quadrature
 
-from pdcorrect.errors import SceneError
-from pdcorrect.fem.assembly import scatter
+from pdcorrect.fem.assembly import scatter, summed_cells
 from pdcorrect.fem.hexahedron import VTK_CORNERS, VTK_NODES
 from pdcorrect.fem.mesh import HexMesh
 from pdcorrect.fem.quadrature import FaceQuadrature, Quadrature, linear_shares, mean_shares
@@ -183,7 +182,11 @@ class Space:
         return _Values(self._basis, self._kind.mass_order)
 
     def cell_masses(self, rule: str) -> Array:
-        """Each cell's share of the mass matrix at density 1, (C, K, K), m3, by `mass_matrix`."""
+        """Each cell's share of the mass matrix at density 1, (C, K, K), m3.
+
+        "lumped": row sums on the diagonal; "consistent"; "averaged": their mean; "per-node": the
+        volume on every node (the mean over the cells that touch it), as DiffPD.
+        """
         if rule == "per-node":
             share = self.volumes()[:, None] / np.bincount(self.cells.ravel())[self.cells]
             return share[:, :, None] * np.eye(self.cells.shape[1])
@@ -264,22 +267,10 @@ def lumped(mass: sp.csr_matrix) -> Array:
 
 
 def mass_matrix(rule: str, space: Space, density: Array) -> sp.csr_matrix:
-    """Mass (N, N), kg, by one of the rules of `scene.Solver`, for densities (C,), kg/m3.
-
-    "lumped": row sums on the diagonal; "consistent"; "averaged": their mean;
-    "per-node": density times cell volume on every node (the mean over the cells
-    that touch it), as DiffPD.
-    """
-    if rule == "per-node":
-        flat, width = space.cells.ravel(), space.cells.shape[1]
-        heaped = np.bincount(flat, np.repeat(density * space.volumes(), width))
-        return sp.diags_array(heaped / np.bincount(flat)).tocsr()
-    consistent = space.mass(density)
+    """Mass (N, N), kg, by one of the rules of `scene.Solver`, for densities (C,), kg/m3."""
     if rule == "consistent":
-        return consistent
-    diagonal = sp.diags_array(lumped(consistent)).tocsr()
-    if rule == "averaged":
-        return sp.csr_matrix(0.5 * (consistent + diagonal))
-    if rule == "lumped":
-        return diagonal
-    raise SceneError(f"solver.mass = {rule!r}: expected lumped, averaged, consistent or per-node.")
+        return space.mass(density)
+    blocks = density[:, None, None] * space.cell_masses(rule)
+    matrix = summed_cells(space.cells, blocks, len(space.positions))
+    matrix.eliminate_zeros()
+    return matrix

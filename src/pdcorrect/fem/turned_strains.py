@@ -20,8 +20,13 @@ derivatives
     (tr S - S) w = sum_m R^T h_m x y_m + a axial(S Y),
 
 [w] the matrix of the cross product with w, axial(A)_i = e_ijk A_jk: the second part is what the
-frame's turning adds, without which forces would have no potential.  Second derivatives are exact
-too.  Everything here counts S and F times a, so that all numbers of z are lengths.
+frame's turning adds, without which forces would have no potential.  Second derivatives are the
+imaginary part of the first after a small imaginary step, exact to rounding (Squire and Trapp 1998);
+the frame of that step is known: with D = R^T dF, R turns by R [r] and S changes by D - [r] S,
+
+    (tr S - S) r = -axial(D).
+
+Everything here counts S and F times a, so that all numbers of z are lengths.
 
 z counts times c(J) e(q), q = sum_n w_n z_n^2 / a^2 with the `SHARES` w.  c is 1 for J above `FADES`
 and 0 below `GONE`: the frame is not defined where two stretches add up to nothing.  e is 1 for q
@@ -33,15 +38,13 @@ with a change of volume, where it falls by 1 % of its largest at nu = 0.45 and 1
 
 from __future__ import annotations
 
+from typing import Any, NamedTuple
+
 import numpy as np
 from numba import njit, prange
-from numpy.typing import NDArray
 
 from pdcorrect.fem.decomposition import OPTIONS, scratch, signed_svd_lanes
 from pdcorrect.fem.kernels import CHUNK, PARALLEL
-from pdcorrect.fem.kernels import gather_nodes as gather_nodes
-
-Array = NDArray[np.float64]
 
 _ROOT = np.sqrt(0.5)
 _ROWS = np.array([0, 1, 2, 1, 2, 0])
@@ -57,14 +60,39 @@ Both are so far apart that energy still grows on the way in where K is as large 
 """
 SHARES = np.repeat([0.5, 1.0], [6, 12])
 """Of the squares of z's numbers in q: that of a cell stretched 1.4 times is 0.1, 2 times 0.6."""
+_FADING, _SHRINKING, _THIRD = 1.0 / (FADES - GONE), 1.0 / (HUGE - LARGE), 1.0 / 3.0
+_STEP = 1e-20
+"""The imaginary step, of displacements."""
+
+
+class Cell(NamedTuple):
+    """One cell's arrays, complex where they took an imaginary step.
+
+    The amplitudes v (7, 3) of its shapes; R, S and Y = (tr S - S)^-1; A, S's adjugate; z and
+    the derivatives y by it (18,); and room: T, B (3, 3), t, w (3,).
+    """
+
+    v: Any
+    R: Any
+    S: Any
+    Y: Any
+    A: Any
+    z: Any
+    y: Any
+    T: Any
+    B: Any
+    t: Any
+    w: Any
 
 
 @njit(**OPTIONS)
-def _tensor(y, out):  # type: ignore[no-untyped-def]
-    """Symmetric tensor (3, 3) of the first six numbers."""
-    for n in range(6):
-        value = y[n] if n < 3 else _ROOT * y[n]
-        out[_ROWS[n], _COLUMNS[n]] = out[_COLUMNS[n], _ROWS[n]] = value
+def _cell(kind):  # type: ignore[no-untyped-def]
+    """Room for a cell, of a type of numbers."""
+    v = np.empty((7, 3), kind)
+    R, S, Y = np.empty((3, 3), kind), np.empty((3, 3), kind), np.empty((3, 3), kind)
+    A, T, B = np.empty((3, 3), kind), np.empty((3, 3), kind), np.empty((3, 3), kind)
+    z, y, t, w = np.empty(18, kind), np.empty(18, kind), np.empty(3, kind), np.empty(3, kind)
+    return Cell(v, R, S, Y, A, z, y, T, B, t, w)
 
 
 @njit(**OPTIONS)
@@ -75,23 +103,16 @@ def _product(A, B, out):  # type: ignore[no-untyped-def]
 
 
 @njit(**OPTIONS)
-def _add_cross(a, b, factor, out):  # type: ignore[no-untyped-def]
-    out[0] += factor * (a[1] * b[2] - a[2] * b[1])
-    out[1] += factor * (a[2] * b[0] - a[0] * b[2])
-    out[2] += factor * (a[0] * b[1] - a[1] * b[0])
-
-
-@njit(**OPTIONS)
-def _add_axial(A, factor, out):  # type: ignore[no-untyped-def]
-    out[0] += factor * (A[1, 2] - A[2, 1])
-    out[1] += factor * (A[2, 0] - A[0, 2])
-    out[2] += factor * (A[0, 1] - A[1, 0])
-
-
-@njit(**OPTIONS)
 def _times(A, x, out):  # type: ignore[no-untyped-def]
     for i in range(3):
         out[i] = A[i, 0] * x[0] + A[i, 1] * x[1] + A[i, 2] * x[2]
+
+
+@njit(**OPTIONS)
+def _axial(A, factor, out):  # type: ignore[no-untyped-def]
+    out[0] = factor * (A[1, 2] - A[2, 1])
+    out[1] = factor * (A[2, 0] - A[0, 2])
+    out[2] = factor * (A[0, 1] - A[1, 0])
 
 
 @njit(**OPTIONS)
@@ -119,98 +140,23 @@ def _spread(A, shapes, sign, out):  # type: ignore[no-untyped-def]
 
 
 @njit(**OPTIONS)
-def _frames(u, cells, shapes, sizes, v, F, U, s, V, B, W):  # type: ignore[no-untyped-def]
-    """Amplitudes v (cells, 7, 3), and signed SVDs of a F, one cell a lane."""
-    for l in range(F.shape[1]):
+def _frames(u, cells, shapes, sizes):  # type: ignore[no-untyped-def]
+    """Amplitudes (cells, 7, 3), and signed SVDs of a F, one cell a lane."""
+    F, U, V, B, W, s, _, _ = scratch(CHUNK)
+    v = np.empty((CHUNK, 7, 3))
+    for l in range(CHUNK):
         c = min(l, len(cells) - 1)
         _amplitudes(u, cells[c], shapes[c], v[l])
         for i in range(3):
             for j in range(3):
                 F[3 * i + j, l] = v[l, j, i] + (sizes[c] if i == j else 0.0)
     signed_svd_lanes(F, U, s, V, B, W)
+    return v, U, s, V
 
 
 @njit(**OPTIONS)
-def _add_tensor(factor, G, y):  # type: ignore[no-untyped-def]
-    """Add a symmetric tensor to the first six numbers."""
-    for n in range(6):
-        i, j = _ROWS[n], _COLUMNS[n]
-        y[n] += factor * (G[i, j] if i == j else G[i, j] / _ROOT)
-
-
-@njit(**OPTIONS)
-def _adjugate(S, out):  # type: ignore[no-untyped-def]
-    """Of a symmetric S."""
-    for i in range(3):
-        j, k = (i + 1) % 3, (i + 2) % 3
-        out[i, i] = S[j, j] * S[k, k] - S[j, k] * S[j, k]
-        out[j, k] = out[k, j] = S[i, j] * S[i, k] - S[i, i] * S[j, k]
-
-
-@njit(**OPTIONS)
-def _add_adjugate_change(factor, S, dS, y):  # type: ignore[no-untyped-def]
-    """Add a multiple of the adjugate's change to the first six numbers."""
-    for i in range(3):
-        j, k = (i + 1) % 3, (i + 2) % 3
-        own = dS[j, j] * S[k, k] + S[j, j] * dS[k, k] - 2.0 * S[j, k] * dS[j, k]
-        other = dS[i, j] * S[i, k] + S[i, j] * dS[i, k] - dS[i, i] * S[j, k] - S[i, i] * dS[j, k]
-        y[i] += factor * own
-        y[3 + i] += factor * other / _ROOT
-
-
-@njit(**OPTIONS)
-def _rise(t, width):  # type: ignore[no-untyped-def]
-    """From 0 at t = 0 to 1 at t = 1, and its first two derivatives by ``width`` times t."""
-    if t >= 1.0:
-        return 1.0, 0.0, 0.0
-    if not t > 0.0:
-        return 0.0, 0.0, 0.0
-    first = 30.0 * t * t * (1.0 - t) ** 2 / width
-    second = 60.0 * t * (1.0 - t) * (1.0 - 2.0 * t) / width**2
-    return t * t * t * (10.0 - 15.0 * t + 6.0 * t * t), first, second
-
-
-@njit(**OPTIONS)
-def _measures(S, size, A, z):  # type: ignore[no-untyped-def]
-    """Make z's first six numbers, those of S - I, E's, and A (3, 3) the adjugate of S.
-
-    Returns c and its two derivatives by A : dS, those of tr E / 3, and e and its two by z . dz.
-    """
-    _adjugate(S, A)
-    J = (S[0, 0] * A[0, 0] + S[0, 1] * A[0, 1] + S[0, 2] * A[0, 2]) / size**3
-    below = J * J + 2.0
-    more = (1.5 * size * (J * J - 1.0) / below - (z[0] + z[1] + z[2])) / 3.0
-    for i in range(3):
-        z[i] += more
-    first = 3.0 * J / (below * below * size**2)
-    second = 3.0 * (2.0 - 3.0 * J * J) / (below**3 * size**5)
-    c, slope, bend = _rise((J - GONE) / (FADES - GONE), (FADES - GONE) * size**3)
-    q = 0.0
-    for n in range(18):
-        q += SHARES[n] * z[n] * z[n] / size**2
-    e, down, turn = _rise((HUGE - q) / (HUGE - LARGE), (LARGE - HUGE) * 0.5 * size**2)
-    return c, slope, bend, first, second, e, down, turn
-
-
-@njit(**OPTIONS)
-def _to_stretch(z, y, A, fades):  # type: ignore[no-untyped-def]
-    """From the derivatives y by c e z to those by z and, of the first six, by S."""
-    c, slope, _, first, _, e, down, _ = fades
-    along = 0.0
-    for n in range(18):
-        along += y[n] * z[n]
-    for n in range(18):
-        y[n] = c * e * y[n] + along * c * down * SHARES[n] * z[n]
-    trace = y[0] + y[1] + y[2]
-    _add_tensor(trace * first + along * slope * e, A, y)
-    for i in range(3):
-        y[i] -= trace / 3.0
-
-
-@njit(**OPTIONS)
-def _strains(v, U, s, V, l, size, R, S, Y, G, z):  # type: ignore[no-untyped-def]
-    """R, S, (tr S - S)^-1 and z of lane l; the rest as `_measures`, G being its A."""
-    floor = KINK * size
+def _polar(U, s, V, l, size, cell):  # type: ignore[no-untyped-def]
+    """R, S and Y of lane l."""
     for i in range(3):
         for j in range(3):
             r, t, y = 0.0, 0.0, 0.0
@@ -218,133 +164,129 @@ def _strains(v, U, s, V, l, size, R, S, Y, G, z):  # type: ignore[no-untyped-def
                 r += U[3 * i + a, l] * V[3 * j + a, l]
                 both = V[3 * i + a, l] * V[3 * j + a, l]
                 t += both * s[a, l]
-                y += both / max(s[(a + 1) % 3, l] + s[(a + 2) % 3, l], floor)
-            R[i, j], S[i, j], Y[i, j] = r, t, y
+                y += both / max(s[(a + 1) % 3, l] + s[(a + 2) % 3, l], KINK * size)
+            cell.R[i, j], cell.S[i, j], cell.Y[i, j] = r, t, y
+
+
+@njit(**OPTIONS)
+def _rise(t, rate):  # type: ignore[no-untyped-def]
+    """From 0 at t = 0 to 1 at t = 1, and ``rate`` times its derivative."""
+    if t.real >= 1.0:
+        return 0.0 * t + 1.0, 0.0 * t
+    if not t.real > 0.0:
+        return 0.0 * t, 0.0 * t
+    return t * t * t * (10.0 - 15.0 * t + 6.0 * t * t), 30.0 * rate * (t * (1.0 - t)) ** 2
+
+
+@njit(**OPTIONS)
+def _strains(cell, size):  # type: ignore[no-untyped-def]
+    """Make z, still without fading, and A.
+
+    Returns c and its derivative by A : dS, e and its by z . dz, and that of tr E / 3.
+    """
+    v, R, S, A, z = cell.v, cell.R, cell.S, cell.A, cell.z
     for n in range(6):
         i, j = _ROWS[n], _COLUMNS[n]
-        z[n] = S[i, j] - size if i == j else S[i, j] / _ROOT
+        z[n] = S[i, j] - size if i == j else 2.0 * _ROOT * S[i, j]
     for m in range(4):
         for i in range(3):
             z[6 + 3 * m + i] = R[0, i] * v[3 + m, 0] + R[1, i] * v[3 + m, 1] + R[2, i] * v[3 + m, 2]
-    return _measures(S, size, G, z)
-
-
-@njit(**OPTIONS)
-def _turning(z, y, S, Y, T, A, t, w):  # type: ignore[no-untyped-def]
-    """w; T becomes the tensor of y, A and t are scratch."""
-    _tensor(y, T)
-    _product(S, T, A)
-    t[:] = 0.0
-    _add_axial(A, 1.0, t)
-    for m in range(4):
-        _add_cross(z[6 + 3 * m : 9 + 3 * m], y[6 + 3 * m : 9 + 3 * m], 1.0, t)
-    _times(Y, t, w)
-
-
-@njit(**OPTIONS)
-def _less_cross(T, w, out):  # type: ignore[no-untyped-def]
-    """T - [w]."""
-    out[:] = T
     for i in range(3):
         j, k = (i + 1) % 3, (i + 2) % 3
-        out[j, k] += w[i]
-        out[k, j] -= w[i]
+        A[i, i] = S[j, j] * S[k, k] - S[j, k] * S[j, k]
+        A[j, k] = A[k, j] = S[i, j] * S[i, k] - S[i, i] * S[j, k]
+    one = 1.0 / size  # complex numbers are slow to divide
+    J = one**3 * (S[0, 0] * A[0, 0] + S[0, 1] * A[0, 1] + S[0, 2] * A[0, 2])
+    over = 1.0 / (J * J + 2.0)
+    more = _THIRD * (1.5 * size * (J * J - 1.0) * over - (z[0] + z[1] + z[2]))
+    for i in range(3):
+        z[i] += more
+    grows = 3.0 * one**2 * J * over * over
+    c, slope = _rise((J - GONE) * _FADING, _FADING * one**3)
+    q = 0.0 * J
+    for n in range(18):
+        q += SHARES[n] * one**2 * (z[n] * z[n])
+    e, down = _rise((HUGE - q) * _SHRINKING, -2.0 * one**2 * _SHRINKING)
+    return c, slope, e, down, grows
 
 
 @njit(**OPTIONS)
-def _conjugates(R, T, w, y, A, out):  # type: ignore[no-untyped-def]
-    """Out (7, 3): R (T - [w]) transposed, R y_m; A is scratch."""
-    _less_cross(T, w, A)
+def _pull(cell, measures, out):  # type: ignore[no-untyped-def]
+    """Out (7, 3): derivatives by v, R (T - [w]) transposed and R y_m, from those y by c e z."""
+    _, R, S, Y, A, z, y, T, B, t, w = cell
+    c, slope, e, down, grows = measures
+    along = 0.0 * c
+    for n in range(18):
+        along += y[n] * z[n]
+    for n in range(18):  # by z
+        y[n] = c * e * y[n] + along * c * down * SHARES[n] * z[n]
+    trace = y[0] + y[1] + y[2]
+    for n in range(6):  # T: by S
+        i, j = _ROWS[n], _COLUMNS[n]
+        T[i, j] = T[j, i] = y[n] if i == j else _ROOT * y[n]
+    for i in range(3):
+        T[i, i] -= _THIRD * trace
+        for j in range(3):
+            T[i, j] += (trace * grows + along * slope * e) * A[i, j]
+    _product(S, T, B)
+    _axial(B, 1.0, t)
+    for m in range(6, 18, 3):
+        t[0] += z[m + 1] * y[m + 2] - z[m + 2] * y[m + 1]
+        t[1] += z[m + 2] * y[m] - z[m] * y[m + 2]
+        t[2] += z[m] * y[m + 1] - z[m + 1] * y[m]
+    _times(Y, t, w)
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        T[j, k] += w[i]
+        T[k, j] -= w[i]
     for i in range(3):
         for j in range(3):
-            out[j, i] = R[i, 0] * A[0, j] + R[i, 1] * A[1, j] + R[i, 2] * A[2, j]
+            out[j, i] = R[i, 0] * T[0, j] + R[i, 1] * T[1, j] + R[i, 2] * T[2, j]
         for m in range(4):
             out[3 + m, i] = R[i, 0] * y[6 + 3 * m] + R[i, 1] * y[7 + 3 * m] + R[i, 2] * y[8 + 3 * m]
 
 
 @njit(**OPTIONS)
-def _change(  # type: ignore[no-untyped-def]
-    dv, R, S, Y, T, w, z, y, K, factor, fades, raw, G, D, A, B, dT, t, turn, dz, dy, dw, out
-):
-    """Out (7, 3): change of `_conjugates` by dv (7, 3); dz (18,) that of z.
-
-    Without y's own second part where ``factor`` is 0: then the result is positive where K is.
-    ``fades`` and G, the adjugate, are of `_measures`; ``raw`` are the derivatives by c e z.
+def _move(cell, a, i, moved, D, turn):  # type: ignore[no-untyped-def]
+    """The cell after an imaginary step of amplitude (a, i), its z to be made; D (3, 3), turn (3,)
+    are room.
     """
-    for i in range(3):
-        for j in range(3):
-            D[i, j] = R[0, i] * dv[j, 0] + R[1, i] * dv[j, 1] + R[2, i] * dv[j, 2]
-    t[:] = 0.0
-    _add_axial(D, -1.0, t)
-    _times(Y, t, turn)  # the frame turns by R [turn]
-    for j in range(3):  # dS = D - [turn] S, column by column
-        B[0, j] = D[0, j] - (turn[1] * S[2, j] - turn[2] * S[1, j])
-        B[1, j] = D[1, j] - (turn[2] * S[0, j] - turn[0] * S[2, j])
-        B[2, j] = D[2, j] - (turn[0] * S[1, j] - turn[1] * S[0, j])
-    for n in range(6):
-        i, j = _ROWS[n], _COLUMNS[n]
-        dz[n] = B[i, j] if i == j else 0.5 * (B[i, j] + B[j, i]) / _ROOT
-    c, slope, bend, first, second, e, down, turned = fades
-    grown = 0.0
-    for i in range(3):
-        for j in range(3):
-            grown += G[i, j] * B[i, j]
-    for i in range(3):
-        dz[i] += first * grown - (B[0, 0] + B[1, 1] + B[2, 2]) / 3.0
-    for m in range(4):
-        part = dz[6 + 3 * m : 9 + 3 * m]
-        for i in range(3):
-            part[i] = R[0, i] * dv[3 + m, 0] + R[1, i] * dv[3 + m, 1] + R[2, i] * dv[3 + m, 2]
-        _add_cross(turn, z[6 + 3 * m : 9 + 3 * m], -1.0, part)
-    longer = 0.0
+    moved.v[:], moved.R[:], moved.S[:], moved.Y[:] = cell.v, cell.R, cell.S, cell.Y
+    moved.v[a, i] += 1j * _STEP
+    if a > 2:
+        return
+    R, S, Y = cell.R, cell.S, cell.Y
+    D[:] = 0.0
+    D[:, a] = R[i]
+    _axial(D, -1.0, cell.t)
+    _times(Y, cell.t, turn)
+    for j in range(3):
+        k, l = (j + 1) % 3, (j + 2) % 3
+        for m in range(3):
+            D[j, m] -= turn[k] * S[l, m] - turn[l] * S[k, m]
+            moved.R[m, j] += 1j * _STEP * (R[m, k] * turn[l] - R[m, l] * turn[k])
+    trace = D[0, 0] + D[1, 1] + D[2, 2]
+    for j in range(3):
+        for k in range(3):
+            change = 0.5 * (D[j, k] + D[k, j])
+            moved.S[j, k] += 1j * _STEP * change
+            cell.T[j, k] = (trace if j == k else 0.0) - change
+    _product(Y, cell.T, cell.B)
+    _product(cell.B, Y, cell.T)
+    for j in range(3):
+        for k in range(3):
+            moved.Y[j, k] -= 1j * _STEP * cell.T[j, k]
+
+
+@njit(**OPTIONS)
+def _stress(K, z, factor, out):  # type: ignore[no-untyped-def]
+    """Out (18,) = factor K z, for symmetric K, whose rows are added up."""
     for n in range(18):
-        longer += SHARES[n] * z[n] * dz[n]
-    ds = slope * e * grown + c * down * longer
-    for n in range(18):
-        total = 0.0
-        for l in range(18):
-            total += K[n, l] * (c * e * dz[l] + ds * z[l])
-        dy[n] = total
-    along, across = 0.0, 0.0
-    for n in range(18):
-        along += raw[n] * z[n]
-        across += dy[n] * z[n] + factor * raw[n] * dz[n]
-    along *= factor
-    more = across * c * down + along * (slope * grown * down + c * turned * longer)
-    own, less = factor * c * e * (raw[0] + raw[1] + raw[2]), along * c * down
-    own += less * SHARES[0] * (z[0] + z[1] + z[2])
-    for n in range(18):
-        dy[n] = c * e * dy[n] + factor * ds * raw[n] + SHARES[n] * (more * z[n] + less * dz[n])
-    trace = dy[0] + dy[1] + dy[2]
-    both = trace * first + across * slope * e + own * second * grown
-    _add_tensor(both + along * (bend * e * grown + slope * down * longer), G, dy)
-    _add_adjugate_change(own * first + along * slope * e, S, B, dy)
-    for i in range(3):
-        dy[i] -= trace / 3.0
-    _tensor(dy, dT)
-    t[:] = 0.0
-    _product(S, dT, A)
-    _add_axial(A, 1.0, t)
-    for m in range(4):
-        here = slice(6 + 3 * m, 9 + 3 * m)
-        _add_cross(z[here], dy[here], 1.0, t)
-        _add_cross(dz[here], y[here], factor, t)
-    if factor != 0.0:
-        _product(B, T, A)
-        _add_axial(A, 1.0, t)
-        trace = B[0, 0] + B[1, 1] + B[2, 2]
-        for i in range(3):
-            t[i] -= trace * w[i] - (B[i, 0] * w[0] + B[i, 1] * w[1] + B[i, 2] * w[2])
-    _times(Y, t, dw)
-    if factor != 0.0:  # R turns: [turn] (T - [w]) and turn x y_m
-        _less_cross(T, w, D)
-        for j in range(3):
-            dT[0, j] += turn[1] * D[2, j] - turn[2] * D[1, j]
-            dT[1, j] += turn[2] * D[0, j] - turn[0] * D[2, j]
-            dT[2, j] += turn[0] * D[1, j] - turn[1] * D[0, j]
-        for m in range(4):
-            _add_cross(turn, y[6 + 3 * m : 9 + 3 * m], 1.0, dy[6 + 3 * m : 9 + 3 * m])
-    _conjugates(R, dT, dw, dy, A, out)
+        out[n] = 0.0
+    for m in range(18):
+        share = factor * z[m]
+        for n in range(18):
+            out[n] += K[m, n] * share
 
 
 @njit(**PARALLEL)
@@ -356,31 +298,35 @@ def energy_and_forces(u, cells, shapes, sizes, matrices, shift, energy, by_cell)
     """
     count = cells.shape[0]
     for chunk in prange((count + CHUNK - 1) // CHUNK):
-        begin, end = chunk * CHUNK, min(count, (chunk + 1) * CHUNK)
-        F, U, V, N, W, s, _, _ = scratch(CHUNK)
-        v, z, y = np.empty((CHUNK, 7, 3)), np.empty(18), np.empty(18)
-        R, S, Y = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
-        T, A, G = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
-        out, t, w = np.empty((7, 3)), np.empty(3), np.empty(3)
-        here = slice(begin, end)
-        _frames(u, cells[here], shapes[here], sizes[here], v, F, U, s, V, N, W)
-        for c in range(begin, end):
-            l = c - begin
-            fades = _strains(v[l], U, s, V, l, sizes[c], R, S, Y, G, z)
-            total = 0.0
-            for n in range(18):
-                row = 0.0
-                for m in range(18):
-                    row += matrices[c, n, m] * z[m]
-                row *= fades[0] * fades[5]
-                less = shift[c, n] if len(shift) else 0.0
-                total += fades[0] * fades[5] * z[n] * (0.5 * row - less)
-                y[n] = row - less
-            energy[c] = total
-            _to_stretch(z, y, G, fades)
-            _turning(z, y, S, Y, T, A, t, w)
-            _conjugates(R, T, w, y, A, out)
-            _spread(out, shapes[c], -1.0, by_cell[c])
+        here = slice(chunk * CHUNK, min(count, (chunk + 1) * CHUNK))
+        _energy_and_forces(
+            u, cells[here], shapes[here], sizes[here], matrices[here], shift[here], energy[here],
+            by_cell[here],
+        )  # fmt: skip
+
+
+# What a thread does of its cells is a function of its own: numba makes loops for threads of
+# expressions on arrays beside a prange, and those on a `Cell` go wrong.
+
+
+@njit(**OPTIONS)
+def _energy_and_forces(u, cells, shapes, sizes, matrices, shift, energy, by_cell):  # type: ignore[no-untyped-def]
+    v, U, s, V = _frames(u, cells, shapes, sizes)
+    cell, out = _cell(np.float64), np.empty((7, 3))
+    for c in range(len(cells)):
+        cell.v[:] = v[c]
+        _polar(U, s, V, c, sizes[c], cell)
+        measures = _strains(cell, sizes[c])
+        fades = measures[0] * measures[2]
+        _stress(matrices[c], cell.z, fades, cell.y)
+        total = 0.0
+        for n in range(18):
+            less = shift[c, n] if len(shift) else 0.0
+            total += fades * cell.z[n] * (0.5 * cell.y[n] - less)
+            cell.y[n] -= less
+        energy[c] = total
+        _pull(cell, measures, out)
+        _spread(out, shapes[c], -1.0, by_cell[c])
 
 
 @njit(**PARALLEL)
@@ -388,17 +334,19 @@ def strains(u, cells, shapes, sizes, out):  # type: ignore[no-untyped-def]
     """Z of each cell, out (C, 18), m."""
     count = cells.shape[0]
     for chunk in prange((count + CHUNK - 1) // CHUNK):
-        begin, end = chunk * CHUNK, min(count, (chunk + 1) * CHUNK)
-        F, U, V, N, W, s, _, _ = scratch(CHUNK)
-        v, G = np.empty((CHUNK, 7, 3)), np.empty((3, 3))
-        R, S, Y = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
-        here = slice(begin, end)
-        _frames(u, cells[here], shapes[here], sizes[here], v, F, U, s, V, N, W)
-        for c in range(begin, end):
-            l = c - begin
-            fades = _strains(v[l], U, s, V, l, sizes[c], R, S, Y, G, out[c])
-            for n in range(18):
-                out[c, n] *= fades[0] * fades[5]
+        here = slice(chunk * CHUNK, min(count, (chunk + 1) * CHUNK))
+        _cell_strains(u, cells[here], shapes[here], sizes[here], out[here])
+
+
+@njit(**OPTIONS)
+def _cell_strains(u, cells, shapes, sizes, out):  # type: ignore[no-untyped-def]
+    v, U, s, V = _frames(u, cells, shapes, sizes)
+    cell = _cell(np.float64)
+    for c in range(len(cells)):
+        cell.v[:] = v[c]
+        _polar(U, s, V, c, sizes[c], cell)
+        measures = _strains(cell, sizes[c])
+        out[c] = measures[0] * measures[2] * cell.z
 
 
 @njit(**PARALLEL)
@@ -408,42 +356,46 @@ def tangents(u, cells, shapes, sizes, matrices, shift, project, out):  # type: i
     ``project`` leaves out what makes them indefinite where K is not.
     """
     count = cells.shape[0]
-    factor = 0.0 if project else 1.0
     for chunk in prange((count + CHUNK - 1) // CHUNK):
-        begin, end = chunk * CHUNK, min(count, (chunk + 1) * CHUNK)
-        F, U, V, N, W, s, _, _ = scratch(CHUNK)
-        v, z, y = np.empty((CHUNK, 7, 3)), np.empty(18), np.empty(18)
-        R, S, Y = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
-        T, A, B = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
-        D, dT, column = np.empty((3, 3)), np.empty((3, 3)), np.empty((7, 3))
-        t, w, turn, dw = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
-        dv, dz, dy = np.zeros((7, 3)), np.empty(18), np.empty(18)
-        raw, G = np.empty(18), np.empty((3, 3))
-        here = slice(begin, end)
-        _frames(u, cells[here], shapes[here], sizes[here], v, F, U, s, V, N, W)
-        for c in range(begin, end):
-            l = c - begin
-            fades = _strains(v[l], U, s, V, l, sizes[c], R, S, Y, G, z)
-            for n in range(18):
-                row = 0.0
-                for m in range(18):
-                    row += matrices[c, n, m] * z[m]
-                y[n] = raw[n] = fades[0] * fades[5] * row - (shift[c, n] if len(shift) else 0.0)
-            _to_stretch(z, y, G, fades)
-            _turning(z, y, S, Y, T, A, t, w)
-            if project:
-                y[:] = 0.0
-            for a in range(7):
-                for i in range(3):
-                    dv[a, i] = 1.0
-                    _change(
-                        dv, R, S, Y, T, w, z, y, matrices[c], factor, fades, raw, G,
-                        D, A, B, dT, t, turn, dz, dy, dw, column,
-                    )  # fmt: skip
-                    dv[a, i] = 0.0
-                    for b in range(7):
-                        for j in range(3):
-                            out[c, 3 * b + j, 3 * a + i] = column[b, j]
+        here = slice(chunk * CHUNK, min(count, (chunk + 1) * CHUNK))
+        _tangents(
+            u, cells[here], shapes[here], sizes[here], matrices[here], shift[here], project,
+            out[here],
+        )  # fmt: skip
+
+
+@njit(**OPTIONS)
+def _tangents(u, cells, shapes, sizes, matrices, shift, project, out):  # type: ignore[no-untyped-def]
+    v, U, s, V = _frames(u, cells, shapes, sizes)
+    cell, moved = _cell(np.float64), _cell(np.complex128)
+    column, change = np.empty((7, 3)), np.empty((7, 3), np.complex128)
+    y, dz, dy, D, turn = np.empty(18), np.empty(18), np.empty(18), np.empty((3, 3)), np.empty(3)
+    for c in range(len(cells)):
+        cell.v[:] = v[c]
+        _polar(U, s, V, c, sizes[c], cell)
+        measures = _strains(cell, sizes[c])
+        _stress(matrices[c], cell.z, measures[0] * measures[2], y)
+        if len(shift):
+            y -= shift[c]
+        for a in range(7):
+            for i in range(3):
+                _move(cell, a, i, moved, D, turn)
+                after = _strains(moved, sizes[c])
+                fades = after[0] * after[2]
+                for n in range(18):
+                    dz[n] = (fades * moved.z[n]).imag / _STEP
+                _stress(matrices[c], dz, 1.0, dy)
+                if project:
+                    cell.y[:] = dy
+                    _pull(cell, measures, column)
+                else:
+                    for n in range(18):
+                        moved.y[n] = complex(y[n], _STEP * dy[n])
+                    _pull(moved, after, change)
+                for b in range(7):
+                    for j in range(3):
+                        value = column[b, j] if project else change[b, j].imag / _STEP
+                        out[c, 3 * b + j, 3 * a + i] = value
 
 
 @njit(**PARALLEL)

@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 
 from pdcorrect._files import replacing
 from pdcorrect.errors import InputError, OutputError, require_extra
-from pdcorrect.fem.mesh import VTK_EDGES, boundary_faces
+from pdcorrect.fem.hexahedron import VTK_EDGES
+from pdcorrect.fem.mesh import boundary_faces
 from pdcorrect.trajectory import Trajectory
 
 Array = NDArray[np.float64]

@@ -175,7 +175,7 @@ def _damped_modes(objective: StepObjective, y: Array) -> Array:
         gradient[:nodes] = 0.0
         blocks = objective.cell_hessians(y, project=True)
         following = Condensed(blocks, problem.space.local, problem.cells.shape[1])
-        change = following.recovered(np.zeros((nodes, 3)), gradient)
+        change = following.response(gradient)
         y = y - change
         if np.abs(change).max() <= _SETTLED * problem.cell_size:
             return y

@@ -20,7 +20,6 @@ import scipy.sparse.linalg as spla
 from numpy.typing import NDArray
 
 from pdcorrect.errors import ConvergenceError, InputError
-from pdcorrect.fem.assembly import Assembly
 from pdcorrect.fem.multigrid import conjugate_gradients
 from pdcorrect.solvers.step import GlobalSolver, HessianOperator
 
@@ -189,12 +188,8 @@ def _gmres(H: AdjointOperator, g: Array, solve: Solve, tolerance: float) -> Adjo
 def assembled(H: HessianOperator) -> tuple[sp.csr_matrix, NDArray[np.int64]]:
     """H as a sparse matrix on the free components of configurations, and their numbers."""
     objective, problem = H.objective, H.objective.problem
-    matrix = Assembly(problem.space.local, problem.unknowns).matrix(H.blocks())
-    mass = problem.mass_matrix.copy()
-    mass.resize((problem.unknowns, problem.unknowns))
-    matrix = matrix + objective.factors[0] * sp.kron(mass, sp.eye_array(3))
     free = np.flatnonzero(objective.free.ravel())
-    return sp.csr_matrix(matrix)[free][:, free], free
+    return problem.assembly.matrix(H.blocks())[free][:, free], free
 
 
 def spectral_radius(H: HessianOperator, solve: GlobalSolver) -> float:

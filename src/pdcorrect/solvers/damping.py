@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from pdcorrect.fem.cell_correction import CorrectionTangent, without_trace
 from pdcorrect.fem.problem import Problem
-from pdcorrect.fem.sensitivities import Following
 from pdcorrect.fem.viscosity import Stretches, product, small_strain_stress
 from pdcorrect.solvers.integrators import StepEquation
 
@@ -46,7 +45,7 @@ class Rayleigh:
         problem = self._problem
         out = self.mass * float(np.vdot(way, problem.mass_times(way)))
         if self.stiffness:
-            x = Following(problem, self.at).lifted(way)
+            x = problem.lifted(self.at, way)
             out += self.stiffness * float(np.vdot(x, self.tangent.apply(x)))
         return out / h
 

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from pdcorrect.errors import InputError
 from pdcorrect.fem.cell_correction import CellCorrection
-from pdcorrect.fem.sensitivities import weight_slopes
 from pdcorrect.scene.materials import lame_slopes
 from pdcorrect.solvers.adjoint_solve import (
     AdjointOperator,
@@ -28,6 +27,7 @@ from pdcorrect.solvers.adjoint_terms import (
     cell_products,
     follower_slope,
     gravity_slope,
+    weight_slopes,
 )
 from pdcorrect.solvers.contact import ContactTerm
 from pdcorrect.solvers.implicit import ImplicitStepper

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -43,30 +44,18 @@ _SHARED_POINTS = 4000
 _LARGEST = 1e30
 
 
-@dataclass
-class _Effort:
-    """Work done in one call, over all its attempts."""
-
-    iterations: int = 0
-    evaluations: int = 0
-
-    def add(self, minimum: Minimum) -> None:
-        self.iterations += minimum.iterations
-        self.evaluations += minimum.evaluations
+_Effort = Counter[str]
+"""Iterations and evaluations of one call, over all its attempts."""
 
 
 @dataclass(eq=False)
 class _Outcome:
-    """The state after one attempt, with energies (J) that went in or out."""
+    """The state after one attempt; ``stats`` are energies (J) then, and what went in or out."""
 
     state: State
     minimum: Minimum
-    elastic_energy: float
-    external_work: float
-    clamp_work: float
-    damping_loss: float
     modes: Array | None
-    more: dict[str, float]
+    stats: dict[str, float]
 
 
 class ImplicitStepper:
@@ -172,7 +161,7 @@ class ImplicitStepper:
         return (state if h == self.time_step else replace(state, memory={})), h
 
     def _step(self, state: State, forces: Array | None, h: float) -> StepResult:
-        effort = _Effort()
+        effort = _Effort(iterations=0, evaluations=0)
         outcome = self._attempt(state, forces, h, effort, self.integrate)
         if not outcome.minimum.status.ok and self._recover:
             outcome = self._substeps(state, forces, h, effort) or outcome
@@ -277,7 +266,7 @@ class ImplicitStepper:
             )
         else:
             minimum = self._solved(objective, objective.start, options)
-        effort.add(minimum)
+        effort.update(iterations=minimum.iterations, evaluations=minimum.evaluations)
         if minimum.status.ok and self._adrift:
             y, gradient = objective.carried(minimum.positions, minimum.gradient)
             minimum = replace(minimum, positions=y, gradient=gradient)
@@ -345,17 +334,11 @@ class ImplicitStepper:
 
     def _report(self, outcome: _Outcome, effort: _Effort) -> StepResult:
         state, minimum = outcome.state, outcome.minimum
-        kinetic = 0.5 * np.vdot(state.velocities, self.problem.mass_times(state.velocities))
         ratios = self.problem.volume_ratios(state.positions)
         stats = {
-            "evaluations": float(effort.evaluations),
-            "elastic_energy": outcome.elastic_energy,
-            "kinetic_energy": float(kinetic),
-            "external_work": outcome.external_work,
-            "clamp_work": outcome.clamp_work,
-            "damping_loss": outcome.damping_loss,
+            "evaluations": float(effort["evaluations"]),
+            **outcome.stats,
             "smallest_volume_ratio": float(ratios.min()),
-            **outcome.more,
         }
         status = minimum.status
         if not status.ok:  # what it remembers would be out of balance
@@ -364,7 +347,7 @@ class ImplicitStepper:
             status = Status.INVERTED
         residual = float(np.abs(minimum.gradient).max())
         return StepResult(
-            state, status, effort.iterations, residual, minimum.estimate, stats, outcome.modes,
+            state, status, effort["iterations"], residual, minimum.estimate, stats, outcome.modes,
             ratios,
         )  # fmt: skip
 
@@ -383,25 +366,22 @@ def _outcome(
     if rollers is not None and objective.attached is not None:
         pushed = unbalanced * problem.free + objective.attached.end_forces(y)
         reaction = reaction + pushed - rollers.along(pushed)
-    clamp_work = float(np.vdot(reaction, moved)) / stage.load_factor
     ends_at_y = stage.gain == 1.0  # otherwise the modes at the end are other ones
     end = y if ends_at_y else problem.relaxed(after.positions)
-    elastic = problem.energy_and_forces(end)[0]
-    for one in problem.attached:
-        elastic += one.energy(end[:nodes] - problem.positions, stage.end)
-    more = {} if objective.contact is None else objective.contact.report(y)
+    attached = [one.energy(end[:nodes] - problem.positions, stage.end) for one in problem.attached]
+    momentum = problem.mass_times(after.velocities)
+    stats = {
+        "elastic_energy": problem.energy_and_forces(end)[0] + sum(attached),
+        "kinetic_energy": 0.5 * float(np.vdot(after.velocities, momentum)),
+        "external_work": float(np.vdot(objective.loads, moved)),
+        "clamp_work": float(np.vdot(reaction, moved)) / stage.load_factor,
+        "damping_loss": objective.damping_loss(y, moved, h),
+    }
+    if objective.contact is not None:
+        stats |= objective.contact.report(y)
     if objective.attached is not None:
-        more |= objective.attached.work(y)
-    return _Outcome(
-        after,
-        minimum,
-        elastic_energy=elastic,
-        external_work=float(np.vdot(objective.loads, moved)),
-        clamp_work=clamp_work,
-        damping_loss=objective.damping_loss(y, moved, h),
-        modes=end[nodes:] if problem.space.internal else None,
-        more=more,
-    )
+        stats |= objective.attached.work(y)
+    return _Outcome(after, minimum, end[nodes:] if problem.space.internal else None, stats)
 
 
 def _joined(parts: list[_Outcome], end: State) -> _Outcome:
@@ -412,16 +392,7 @@ def _joined(parts: list[_Outcome], end: State) -> _Outcome:
         estimate=max(part.minimum.estimate for part in parts),
         gradient=max((part.minimum.gradient for part in parts), key=lambda g: np.abs(g).max()),
     )
-    return _Outcome(
-        end,
-        minimum,
-        last.elastic_energy,
-        external_work=sum(part.external_work for part in parts),
-        clamp_work=sum(part.clamp_work for part in parts),
-        damping_loss=sum(part.damping_loss for part in parts),
-        modes=last.modes,
-        more=joined_stats([part.more for part in parts]),
-    )  # fmt: skip
+    return _Outcome(end, minimum, last.modes, joined_stats([part.stats for part in parts]))
 
 
 @cache

@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 from pdcorrect.errors import ConvergenceError, InputError
 from pdcorrect.fem.multigrid import conjugate_gradients
 from pdcorrect.fem.problem import Problem
-from pdcorrect.fem.sensitivities import Following
 from pdcorrect.fem.viscosity import Stretches, small_strain_stress
 from pdcorrect.solvers.contact import Sliding
 from pdcorrect.solvers.step import check_input, nodal_array
@@ -135,7 +134,7 @@ def forces_at(problem: Problem, state: State, forces: Array | None = None) -> Ar
     if damping.viscosity:
         here = problem.relaxed(state.positions)
         at = Stretches(problem, here)
-        rate = at.rates(Following(problem, here).lifted(state.velocities))
+        rate = at.rates(problem.lifted(here, state.velocities))
         out -= damping.viscosity * at.forces(small_strain_stress(problem, rate))[: len(out)]
         if problem.correction is not None:
             u = state.positions - problem.positions

@@ -174,18 +174,27 @@ class StepObjective:
         return out
 
     def cell_hessians(self, y: Array, project: bool = False, at_rest: bool = False) -> Array:
-        """Second derivative without inertia, by cell: (C, L, L, 3, 3), N/m.
+        """Second derivative by cell, (C, L, L, 3, 3), N/m.
 
         ``project`` raises negative eigenvalues to zero at each quadrature point.
         ``at_rest``: damping in proportion to the stiffness at y itself, so that the
         result does not depend on the state at the step's start.
         """
-        if at_rest:
-            blocks = self.problem.linearise(y, project).blocks() * self.factors[1]
-            for one in self.problem.attached:
-                one.rest_tangent().add_to(blocks)
-            return blocks
-        return self.hessian_operator(y, project).blocks()
+        if not at_rest:
+            return self.hessian_operator(y, project).blocks()
+        blocks = self.problem.linearise(y, project).blocks() * self.factors[1]
+        for one in self.problem.attached:
+            one.rest_tangent().add_to(blocks)
+        return self.with_inertia(blocks)
+
+    def with_inertia(self, blocks: Array) -> Array:
+        """Matrices (C, L, L, 3, 3) of the cells, to which that of their masses is added."""
+        nodes, factor = self.problem.cells.shape[1], self.factors[0]
+        if factor:
+            masses = self.problem.materials.density[:, None, None] * self.problem.cell_masses
+            for i in range(3):
+                blocks[:, :nodes, :nodes, i, i] += factor * masses
+        return blocks
 
     def hessian_operator(self, y: Array, project: bool = False) -> HessianOperator:
         """The second derivative without assembling; ``project`` as in `cell_hessians`."""
@@ -236,8 +245,8 @@ class HessianOperator:
         return out
 
     def blocks(self) -> Array:
-        """Without inertia, by cell, (C, L, L, 3, 3)."""
-        out = self.tangent.blocks()
+        """By cell, (C, L, L, 3, 3)."""
+        out = self.objective.with_inertia(self.tangent.blocks())
         rayleigh = self.objective.rayleigh
         if rayleigh is not None and rayleigh.stiffness:
             out += rayleigh.stiffness * rayleigh.tangent.blocks()

@@ -12,7 +12,6 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from pdcorrect._environment import total_memory
-from pdcorrect.fem.assembly import Assembly
 from pdcorrect.fem.factorisation import (
     MEMORY_SHARE,
     Backend,
@@ -60,8 +59,8 @@ class TangentFactory:
     def __init__(self, problem: Problem, backend: Backend = "auto") -> None:
         self.problem = problem
         self.order = problem.band_order
-        self.backend = ("band" if self._band_pays else "amg") if backend == "auto" else backend
-        self._nodes = Assembly(problem.cells, len(problem.positions))
+        best: Backend = "band" if self._band_pays else "amg"
+        self.backend = best if backend == "auto" else backend
         self._free = np.flatnonzero(problem.free.ravel())
 
     @property
@@ -102,70 +101,60 @@ class TangentFactory:
         fits = self.order.factor_bytes < min(_LARGEST_BAND, MEMORY_SHARE * total_memory())
         return fits and seconds < _CYCLE_SECONDS * self._entries
 
-    def factorise(self, objective: StepObjective, y: Array) -> tuple[TangentSolver, bool]:
+    def factorise(
+        self, objective: StepObjective, y: Array, at_rest: bool = False
+    ) -> tuple[TangentSolver, bool]:
         """A factor of the Hessian at a configuration, and whether it is the exact one.
 
         Where the exact Hessian is not positive definite, negative eigenvalues are
         raised to zero at each quadrature point (Teran et al. 2005), with a growing
         shift where that is singular.  `NotPositiveDefinite` is raised if all of that fails.
+        ``at_rest``: damping too is taken at y, not at the step's start.
         """
         try:
-            return self._solver(objective, y, self.backend), True
+            return self._solver(objective, y, at_rest=at_rest), True
         except (NotPositiveDefinite, np.linalg.LinAlgError):
-            return self._projected(objective, y, self.backend), False
+            return self._projected(objective, y, at_rest=at_rest), False
 
     def first_hessian(
         self, objective: StepObjective, y: Array, at_rest: bool = False
     ) -> TangentSolver:
-        """A fixed symmetric positive solver for L-BFGS: a factor, or a cycle of multigrid.
+        """A fixed symmetric positive solver for L-BFGS: a factor, or a cycle of multigrid."""
+        if self.backend == "amg":
+            return self.approximate(objective, y, at_rest)
+        return self.factorise(objective, y, at_rest)[0]
 
-        ``at_rest``: damping too is taken at y, not at the step's start.
-        """
-        approximate = self.backend == "amg"
-        if not approximate:
-            with suppress(NotPositiveDefinite, np.linalg.LinAlgError):
-                return self._solver(objective, y, self.backend, at_rest=at_rest)
-        return self._projected(objective, y, self.backend, approximate, at_rest)
-
-    def approximate(self, objective: StepObjective, y: Array) -> TangentSolver:
-        """One cycle of multigrid for the projected Hessian: symmetric, positive, cheap."""
-        return self._projected(objective, y, "amg", approximate=True)
-
-    def _projected(
-        self,
-        objective: StepObjective,
-        y: Array,
-        backend: Backend,
-        approximate: bool = False,
-        at_rest: bool = False,
+    def approximate(
+        self, objective: StepObjective, y: Array, at_rest: bool = False
     ) -> TangentSolver:
+        """One cycle of multigrid for the projected Hessian: symmetric, positive, cheap."""
+        return self._projected(objective, y, at_rest=at_rest, approximate=True)
+
+    def _projected(self, objective: StepObjective, y: Array, **how: bool) -> TangentSolver:
         for shift in (0.0, *_SHIFTS):
             with suppress(NotPositiveDefinite, np.linalg.LinAlgError):
-                return self._solver(objective, y, backend, shift, True, approximate, at_rest)
+                return self._solver(objective, y, shift, project=True, **how)
         raise NotPositiveDefinite("no shift made the projected tangent positive definite")
 
     def _solver(
         self,
         objective: StepObjective,
         y: Array,
-        backend: Backend,
         shift: float = 0.0,
+        *,
         project: bool = False,
         approximate: bool = False,
         at_rest: bool = False,
     ) -> TangentSolver:
-        problem, mass_factor = self.problem, objective.factors[0]
-        blocks, modes = objective.cell_hessians(y, project, at_rest), None
-        if problem.space.internal:
-            modes = Condensed(blocks, problem.space.local, problem.cells.shape[1], shift)
-            blocks = modes.blocks
+        backend: Backend = "amg" if approximate else self.backend
+        problem = self.problem
+        blocks = objective.cell_hessians(y, project, at_rest)
+        modes = Condensed(blocks, problem.space.local, problem.cells.shape[1], shift)
         if backend == "band":
-            band = self.order.assemble(blocks, problem.mass_matrix, mass_factor)
+            band = self.order.assemble(modes.blocks)
             band[:, 0] += shift * band[:, 0].max()
             return TangentSolver(self.order.factorise(band), None, modes)
-        matrix = self._nodes.matrix(blocks)
-        if mass_factor:
-            matrix = matrix + mass_factor * sp.kron(problem.mass_matrix, sp.eye_array(3))
+        matrix = problem.nodal_assembly.matrix(modes.blocks)
         if shift:
             matrix = matrix + shift * matrix.diagonal().max() * sp.eye_array(matrix.shape[0])
         matrix = sp.csr_matrix(matrix)[self._free][:, self._free]
@@ -177,16 +166,11 @@ class TangentFactory:
 class TangentSolver:
     """r -> H^-1 r on configurations (N + B, 3), zero where clamped."""
 
-    def __init__(
-        self, factor: Factor, free: NDArray[np.int64] | None, modes: Condensed | None
-    ) -> None:
+    def __init__(self, factor: Factor, free: NDArray[np.int64] | None, modes: Condensed) -> None:
         self._factor, self._free, self._modes = factor, free, modes
 
     def __call__(self, r: Array) -> Array:
-        if self._modes is None:
-            return self._solve(r)
-        nodal = self._solve(self._modes.reduced(r))
-        return self._modes.recovered(nodal, r)
+        return self._modes.recovered(self._solve(self._modes.reduced(r)), r)
 
     def _solve(self, r: Array) -> Array:
         if self._free is None:
