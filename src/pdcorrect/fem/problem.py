@@ -70,6 +70,12 @@ class Problem(ElasticBody):
             f"{len(self.cells)} {self.element} cells, {self.mass_rule} mass)"
         )
 
+    def _freeze(self) -> None:
+        super()._freeze()
+        materials, mass = self.materials, self.mass_matrix
+        freeze(materials.mu, materials.volume_weight, materials.density)
+        freeze(self.clamps.free, mass.data, mass.indices, mass.indptr)
+
     # --- names of the contract --------------------------------------------------
 
     @property
@@ -299,12 +305,12 @@ def problem_from_body(scene: Scene, refine: int, body: ElasticBody) -> Problem:
         points = surface_points(body.mesh, space, clamps.free)
         young = max([scene.material.young, *(part.young or 0.0 for part in scene.materials)])
         contact = Contact(scene.obstacles, points, space.positions, body.cell_size, young)
-    freeze(clamps.free, matrix.indices, matrix.indptr)
-    freeze(materials.mu, materials.volume_weight, materials.density, matrix.data)
-    return Problem(
+    problem = Problem(
         body.mesh, space, quadrature, materials, body.cell_size, scene, refine, matrix, clamps,
         loads, contact, correction=correction,
     )  # fmt: skip
+    problem._freeze()
+    return problem
 
 
 def _learned(scene: Scene, body: ElasticBody, clamps: Clamps) -> CellCorrection:
