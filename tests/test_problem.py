@@ -338,7 +338,9 @@ def test_materials_by_region_reach_their_cells():
 # --- changes ------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("copied", [lambda x: x, copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x))])
+@pytest.mark.parametrize(
+    "copied", [lambda x: x, copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x))]
+)
 def test_a_problem_cannot_be_changed_behind_its_factors_back(copied):
     problem = copied(pc.discretise(beam()))
     for array in (problem.positions, problem.free, problem.materials.mu, problem.mass_matrix.data):
