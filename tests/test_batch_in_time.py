@@ -104,7 +104,11 @@ def test_steps_and_derivatives_are_those_of_single_steps(case, integrator, devic
 
 @pytest.mark.parametrize(
     ("integrator", "mode"),
-    [("bdf2", "unrolled"), ("midpoint", "checkpointed"), ("generalised-alpha", "checkpointed")],
+    [
+        ("bdf2", "unrolled"),
+        pytest.param("midpoint", "checkpointed", marks=pytest.mark.slow),
+        ("generalised-alpha", "checkpointed"),
+    ],
 )
 def test_a_layer_differentiates_through_the_memory_of_its_steps(integrator, mode):
     problems = [problem(n, integrator, "hex8", {"viscosity": 2e-3}, FOLLOWERS[:1], False)
