@@ -10,6 +10,7 @@ from conftest import beam
 
 DAMPING = {"mass": 1.0, "stiffness": 1e-3, "viscosity": 1e-3}
 SMALL = (2, 2, 2)
+EULER = beam(SMALL, time={"integrator": "backward-euler"})
 
 
 def step(problem):
@@ -23,15 +24,17 @@ def step(problem):
 def trilinear():
     step(pc.discretise(beam(SMALL)))
     step(pc.discretise(beam(SMALL, damping=DAMPING)))
-    scene = beam(SMALL, time={"integrator": "backward-euler"})
-    pc.rollout(pc.hybrid_of(scene, "tiny", gate=None), frames=2)
+    pc.rollout(pc.hybrid_of(EULER, "tiny", gate=None), frames=2)
 
 
 def modes():
     problem = pc.discretise(pc.best_coarse(beam(SMALL, damping=DAMPING)))
-    problem.relaxed(problem.positions)  # the longest one, which the other process has no need of
+    problem.relaxed(problem.positions)  # the longest one, which the other process needs last
     step(problem)
     step(pc.discretise(pc.learned_coarse(beam(SMALL, damping=DAMPING))))
+    hybrid = pc.hybrid_of(EULER, "tiny", gate=None)
+    hybrid.corrector.network.double()  # as most tests have it
+    pc.rollout(hybrid, frames=2)
 
 
 if __name__ == "__main__":
