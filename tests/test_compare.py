@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import pdcorrect as pc
-from conftest import beam, cross
+from conftest import beam
 from hybrid_samples import problems, saved
 from pdcorrect.cli.common import BAD_INPUT, FAILED
 from pdcorrect.cli.compare import _print_table
