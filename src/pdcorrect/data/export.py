@@ -208,7 +208,7 @@ def export_vtu(
 def _write_split(path: Path, folder: str | Path, split: str, base: str) -> dict[str, Any]:
     """One file of the MeshGraphNet layout; returns its description."""
     first: dict[str, Any] = {}
-    with h5py.File(path, "w") as file:
+    with h5py.File(path, "w", locking=False) as file:
         for number, (where, shard, simulation) in enumerate(_simulations(folder, split)):
             fields = _fields(where, shard, simulation, base)
             meta = _meta(fields, float(shard.attributes["time_step"]))

@@ -47,7 +47,7 @@ def _read(path: Path, frame: int) -> tuple[Array, NDArray[np.int64], Array, Arra
     import h5py  # only where there is a file
 
     try:
-        with h5py.File(path) as file:
+        with h5py.File(path, locking=False) as file:
             count = len(file["times"])
             if not -count <= frame < count:
                 raise SceneError(
