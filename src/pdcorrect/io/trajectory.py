@@ -353,7 +353,7 @@ class TrajectoryWriter:
                 _abandon(self._file, self.path)
             number = getattr(error, "errno", None)
             reason = " ".join(str(error).split()) if number is None else os.strerror(number)
-            remedy = _REMEDIES.get(number, "Free some space or choose another place.")
+            remedy = _REMEDIES.get(number or 0, "Free some space or choose another place.")
             raise OutputError(
                 f"{self.path}: cannot be written ({reason}); its first {self._frames} "
                 f"frames are intact. {remedy}"

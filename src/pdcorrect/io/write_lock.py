@@ -34,8 +34,8 @@ class WriteLock:
     """
 
     def __init__(self, path: Path) -> None:
-        self.path, self._file = path, None
-        self._status = _status(path)
+        self.path, self._status = path, _status(path)
+        self._file: int | None = None
         self.acquire()
 
     def __enter__(self) -> WriteLock:
