@@ -50,9 +50,9 @@ def simulate(
     Exit status 1 if frames ended with inverted cells, which are written all the same.
     """
     from pdcorrect._files import make_folder
-    from pdcorrect.evaluation.report import inverted_frames
     from pdcorrect.io.trajectory import load_trajectory
     from pdcorrect.scene import Scene
+    from pdcorrect.solvers.rollout import inverted_frames
 
     if resume and overwrite:
         raise InputError("--resume with --overwrite: expected one of them; resume keeps the file.")
@@ -167,7 +167,8 @@ def _run(
 
 def _summary(stats: dict[str, Any], stepper: Stepper, resumed: int) -> None:
     """Frames, time, iterations, energy, and what is unusual about a run."""
-    from pdcorrect.evaluation.report import gained_energy, refused_corrections, three_digits
+    from pdcorrect.evaluation.report import refused_corrections, three_digits
+    from pdcorrect.solvers.rollout import gained_energy
 
     count, seconds = len(stats["seconds"]), stats["seconds"].sum()
     problem, status = stepper.problem, stats["status"].tolist()

@@ -7,9 +7,8 @@ import dataclasses
 import io
 import json
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +20,7 @@ from pdcorrect.evaluation.compare import Comparison, Row
 from pdcorrect.evaluation.converged import MESH_ERROR, TIME_ERROR
 from pdcorrect.io.vtk import delete_vtu_series, write_vtu_series
 from pdcorrect.metrics import largest_displacement, probes
-from pdcorrect.state import Status
+from pdcorrect.solvers.rollout import inverted_frames
 from pdcorrect.trajectory import Trajectory
 
 Array = NDArray[np.float64]
@@ -30,8 +29,6 @@ VTU = "vtu"
 """Folder, inside a report's, of what `write_series` writes."""
 _NOT_UNIQUE = 100.0
 """Tolerances by which PD and Newton differ where they have taken different branches."""
-_GAINED = 0.1
-"""Of a run's largest energy: more than steps of second order gain where they are short enough."""
 
 # --- the table ---------------------------------------------------------------------------
 
@@ -339,39 +336,3 @@ def refused_corrections(reasons: Iterable[float]) -> str:
         return ""
     counts = ", ".join(f"{one.steps} because {one.reason.meaning}" for one in found)
     return f"{sum(one.steps for one in found)} of {len(every)} corrections were refused ({counts})."
-
-
-def gained_energy(stats: Mapping[str, Any]) -> str:
-    """Whether a run has more energy than was put in since its first step; empty if not."""
-    stored = np.asarray(stats["elastic_energy"]) + np.asarray(stats["kinetic_energy"])
-    put_in = np.asarray(stats["external_work"]) + stats["clamp_work"] - stats["damping_loss"]
-    if "contact_energy" in stats:
-        stored = stored + stats["contact_energy"]
-        put_in = put_in + stats["obstacle_work"] - stats["friction_loss"]
-    if "actuator_work" in stats:
-        put_in = put_in + stats["actuator_work"]
-    put_in = np.cumsum(put_in)
-    gained = float(((stored - stored[0]) - (put_in - put_in[0])).max())
-    if not gained > _GAINED * stored.max():
-        return ""
-    return (
-        f"the run gained {gained:.3g} J that nothing put in: take smaller steps or a smaller "
-        "spectral_radius"
-    )
-
-
-def inverted_frames(stats: Mapping[str, Any], step: float) -> str:
-    """How many frames of a run ended with inverted cells, and the first one; empty if none.
-
-    ``step`` is the length of a frame, s.
-    """
-    inverted = np.asarray(stats["status"]) == Status.INVERTED.name
-    if "smallest_volume_ratio" in stats:  # also after a fallback, which the status names instead
-        inverted = inverted | (np.asarray(stats["smallest_volume_ratio"]) <= 0.0)
-    if not inverted.any():
-        return ""
-    first = 1 + int(inverted.argmax())
-    return (
-        f"{inverted.sum()} of {len(inverted)} frames ended with inverted or folded cells, the "
-        f"first at t = {first * step:g} s"
-    )

@@ -163,7 +163,9 @@ class Problem(ElasticBody):
         wanted[moved] = initial.velocities(self.positions[moved], centre)
         if initial.run is not None:
             frame = -1 if initial.frame is None else initial.frame
-            start, speed = motion_from(initial.run, frame, self.positions, self.cell_size)
+            start, speed = motion_from(
+                initial.run, frame, self.positions, self.cell_size, self.scene.clamps
+            )
             jump = np.abs(start - self.clamped_positions(0.0))[~self.free].max(initial=0.0)
             if jump > _JUMP * self.cell_size:
                 warnings.warn(

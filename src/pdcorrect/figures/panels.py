@@ -6,6 +6,7 @@ All panels share a camera with parallel projection, so that lengths compare.
 from __future__ import annotations
 
 import contextlib
+import os
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
@@ -30,6 +31,8 @@ _OVERSAMPLING = 2
 _LIGHTS = ((-0.3, 0.6, 1.0), 0.75), ((0.6, -0.5, 1.0), 0.5)
 """Places (right, up, towards the camera) and strengths."""
 
+_WINDOW = "VTK_DEFAULT_OPENGL_WINDOW"
+"""Variable of the environment that VTK reads."""
 _PLAIN, _INK = "#7f9fc4", "#202020"
 
 
@@ -214,7 +217,14 @@ def _edge_length(run: Trajectory) -> float:
 
 
 def _pyvista() -> Any:
-    """pyvista, without VTK's warning that there is no X server."""
+    """pyvista, without VTK's warning that there is no X server.
+
+    Where the environment asks VTK for an X window, drawing may crash: another process tries first.
+    """
+    if "X" in os.environ.get(_WINDOW, "") and not (found := check_offscreen()).startswith("ok"):
+        raise OutputError(
+            f"nothing can be drawn with {_WINDOW}={os.environ[_WINDOW]}: {found}; or unset it."
+        )
     pyvista = require_extra("pyvista", "view")
     logger = require_extra("vtkmodules.vtkCommonCore", "view").vtkLogger
     logger.SetStderrVerbosity(logger.VERBOSITY_ERROR)
