@@ -22,6 +22,13 @@ def scene_file(tmp_path):
     return path
 
 
+def test_the_version_is_told(program):
+    module = [sys.executable, "-m", "pdcorrect", "--version"]
+    told = subprocess.run(module, capture_output=True, text=True, check=True).stdout
+    assert program("--version") == (0, told, "")
+    assert told.strip() == pc.__version__
+
+
 def test_simulate_writes_the_rollout(program, scene_file, tmp_path):
     output = tmp_path / "run.h5"
     status, out, err = program("simulate", scene_file, "-o", output)

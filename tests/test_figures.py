@@ -386,6 +386,14 @@ def test_drawing_is_probed_in_another_process(monkeypatch):
     assert "no answer in 0.5 s" in figures.check_offscreen(timeout=0.5)
 
 
+def test_an_x_window_that_cannot_be_opened_is_told_before_it_crashes(monkeypatch, tmp_path):
+    monkeypatch.setenv("VTK_DEFAULT_OPENGL_WINDOW", "vtkXOpenGLRenderWindow")
+    monkeypatch.delenv("DISPLAY", raising=False)
+    with pytest.raises(OutputError, match="VTK_DEFAULT_OPENGL_WINDOW"):
+        figures.render(trajectory(), tmp_path / "run.png")
+    assert not list(tmp_path.iterdir())
+
+
 def test_short_times_are_told_in_a_unit_that_shows_them():
     from pdcorrect.figures.sheet import time_text
 
