@@ -160,5 +160,3 @@ def test_inverted_frames_are_told_by_the_interface_too():
     problem = pc.discretise(beam((2, 1, 1)))
     with pytest.warns(PdcorrectWarning, match="1 of 1 frames ended with inverted"):
         pc.rollout(Folding(problem), 1, on_failure="continue")
-    with pytest.raises(InputError, match="frames = 0"):
-        pc.rollout(pc.ProjectiveDynamics(problem), 0)

@@ -402,6 +402,11 @@ def test_correctors_of_one_name_are_told_apart_and_cases_of_one_label_refused(tm
         pc.compare(beam((2, 1, 1)), cases=CASES[2:3] * 2)
 
 
+def test_comparisons_of_no_frames_are_refused():
+    with pytest.raises(InputError, match="frames = 0"):
+        pc.compare(beam((2, 1, 1)), 0)
+
+
 def test_a_base_is_known():
     scene, case = beam((2, 1, 1)), CASES[1]
     with pytest.raises(InputError, match="base 'worst'"):

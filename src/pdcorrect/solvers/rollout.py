@@ -57,7 +57,7 @@ def march(
     if on_failure not in ("raise", "stop", "continue"):
         raise InputError(f"on_failure = {on_failure!r}: expected 'raise', 'stop' or 'continue'.")
     problem = stepper.problem
-    frames = whole("frames", problem.scene.time.frames if frames is None else frames, 1)
+    frames = whole("frames", problem.scene.time.frames if frames is None else frames)
     current = problem.initial_state() if state is None else state
     for frame in range(1, frames + 1):
         started, results = time.perf_counter(), []
