@@ -143,7 +143,7 @@ def render(
     count, side = chosen.shape[1], len(runs)
     panels = [(body, time) for time in range(count) for body in range(side)]
     a_page = side if film else len(panels)
-    in_rows = not film and (side == 1 or count == 1)
+    in_rows = film or side == 1 or count == 1
     columns = -(-a_page // -(-a_page // _ROW)) if in_rows else side  # about as many in each row
     rows, captions = -(-a_page // columns), names + [""] * (a_page - side)
     width, height = size or (window or _usual_width(columns, film), None)
