@@ -37,7 +37,7 @@ _OVERSAMPLING = 2
 _LIGHTS = ((-0.3, 0.6, 1.0), 0.75), ((0.6, -0.5, 1.0), 0.5)
 """Places (right, up, towards the camera) and strengths."""
 
-_PLAIN, _INK, _OBSTACLE = "#7f9fc4", "#202020", "#7d8590"
+_PLAIN, _INK, OBSTACLE = "#7f9fc4", "#202020", "#7d8590"
 _NEAR = 0.6  # of the body's diagonal: what is seen of obstacles around it
 
 
@@ -190,7 +190,7 @@ class Painter:
         rest: bool,
         colours: Sequence[str] | None = None,
     ) -> None:
-        self._pv = _pyvista()
+        self._pv = quiet_pyvista()
         self._view = view
         size = tuple(_OVERSAMPLING * s for s in view.size)
         self._plotter = self._pv.Plotter(off_screen=True, window_size=size, lighting="none")
@@ -251,8 +251,8 @@ class Painter:
     def _add_obstacle(self, surface: Surface) -> Any:
         """Translucent, so that it hides no body."""
         actor = self._plotter.add_mesh(
-            surface.mesh, color=_OBSTACLE, opacity=0.3, ambient=0.5, diffuse=0.55,
-            show_edges=surface.flat, edge_color=_OBSTACLE, line_width=1.5 * _OVERSAMPLING,
+            surface.mesh, color=OBSTACLE, opacity=0.3, ambient=0.5, diffuse=0.55,
+            show_edges=surface.flat, edge_color=OBSTACLE, line_width=1.5 * _OVERSAMPLING,
         )  # fmt: skip
         return actor
 
@@ -309,7 +309,7 @@ def _edge_length(run: Trajectory) -> float:
     return float(np.median(np.linalg.norm(ends[:, :, 1] - ends[:, :, 0], axis=-1)))
 
 
-def _pyvista() -> Any:
+def quiet_pyvista() -> Any:
     """pyvista, without VTK's warning that there is no X server."""
     pyvista = require_extra("pyvista", "view")
     logger = require_extra("vtkmodules.vtkCommonCore", "view").vtkLogger
