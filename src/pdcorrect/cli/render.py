@@ -48,6 +48,7 @@ def render(
         raise InputError(f"--frame with {output.suffix}: a film shows all frames; leave it out.")
     number = -1 if frame is None else frame
     view = _camera(camera)
+    field: Any = None if colour is Colour.none else colour.value
     loaded = [load_trajectory(path) for path in runs]
     names = label or [path.stem for path in runs]
     if overlay:
@@ -58,7 +59,7 @@ def render(
             loaded,
             output,
             labels=names,
-            colour=None if colour is Colour.none else colour.value,
+            colour=field,
             reference=loaded[-1] if colour is Colour.error else None,
             frame=number if still else None,
             fps=fps,

@@ -67,7 +67,7 @@ def _server(title: str, stage: Stage, colours: Sequence[str]) -> Any:
             window = vtk.VtkRemoteView(stage.plotter.render_window, ref="window")
 
     @state.change("colour")
-    def _coloured(colour: str, **_: Any) -> None:
+    def _coloured(colour: Any, **_: Any) -> None:
         stage.colour_by(colour)
         _moved(state.frame)
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 import pdcorrect.figures as figures
 from pdcorrect._environment import environment
@@ -197,7 +197,7 @@ def draw_figures(comparison: Comparison, folder: Path) -> dict[str, str]:
         )
         found["overlay.png"] = "Runs over each other where the last of them is farthest away."
     problem = next(iter(runs.values())).problem
-    free = None if problem is None else problem.free[problem.mesh.coarse_nodes].all(axis=1)
+    free = True if problem is None else problem.free[problem.mesh.coarse_nodes].all(axis=1)
     found |= draw_places(runs, comparison.scene, farthest_point(truth, free), folder)
     relative = comparison.converged is not None
     marks = {row.label: (row.seconds_a_frame, _error(row)) for row in comparison.rows}
@@ -242,10 +242,10 @@ def film_frames(count: int) -> list[int]:
     return np.unique(np.linspace(0, count - 1, min(count, 40)).round().astype(int)).tolist()
 
 
-def farthest_point(run: Trajectory, free: NDArray[np.bool_] | None = None) -> Array:
+def farthest_point(run: Trajectory, free: ArrayLike = True) -> Array:
     """Where the node is at rest that moves farthest, (3,), m, among ``free`` ones (N,)."""
     distance = np.linalg.norm(run.positions - run.points, axis=2).max(axis=0)
-    return run.points[(distance if free is None else distance * free).argmax()]
+    return run.points[(distance * np.asarray(free)).argmax()]
 
 
 def draw_places(

@@ -37,7 +37,8 @@ class Stage:
     def colour_by(self, colour: Colour) -> None:
         """Colour the body by a field, on one scale for all frames."""
         (body,), bar = scaled([body_of(self.run, self._frames, colour)], colour)
-        self._values, self._body["value"] = body.values, body.values[0]
+        self._values = np.asarray(body.values)
+        self._body["value"] = self._values[0]
         for title in list(self.plotter.scalar_bars.keys()):
             self.plotter.remove_scalar_bar(title)
         self.plotter.add_mesh(
