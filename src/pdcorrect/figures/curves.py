@@ -24,7 +24,13 @@ _ENERGIES = {
     "kinetic_energy": "kinetic [J]",
     "external_work": "work of the loads [J]",
 }
-_OTHER_WORK = {"clamp_work": "work of the clamps [J]", "damping_loss": "lost to damping [J]"}
+_OTHER_WORK = {
+    "clamp_work": "work of the clamps [J]",
+    "obstacle_work": "work of the obstacles [J]",
+    "actuator_work": "work of the actuators [J]",
+    "damping_loss": "lost to damping [J]",
+    "friction_loss": "lost to friction [J]",
+}
 """Drawn where a run has any."""
 
 
@@ -141,7 +147,7 @@ def plot_energy(
 ) -> Path:
     """Elastic and kinetic energy and the work of the loads so far, over time, J.
 
-    Likewise the work of moving clamps and the loss to damping, where there is any.
+    Likewise the work of clamps, obstacles and actuators and the losses, where there are any.
     """
     runs = _labelled(trajectories, labels)
     names = {name: t for name, t in _ENERGIES.items() if any(name in r.stats for r, _ in runs)}
