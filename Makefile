@@ -21,6 +21,7 @@ test: $(VENV)/dev.stamp
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m "not slow" -n $(JOBS) --dist loadfile --no-loadscope-reorder
 
 test-slow: $(VENV)/dev.stamp
+	$(MAKE) --jobs=$(JOBS) kernels-trilinear kernels-modes
 	$(BIN)/python -m pytest -m slow
 
 kernels-%: $(VENV)/dev.stamp

@@ -23,13 +23,11 @@ def step(problem):
 def trilinear():
     step(pc.discretise(beam(SMALL)))
     step(pc.discretise(beam(SMALL, damping=DAMPING)))
-    scene = beam(SMALL, time={"integrator": "backward-euler"})
-    pc.rollout(pc.hybrid_of(scene, "tiny", gate=None), frames=2)
 
 
 def modes():
     problem = pc.discretise(pc.best_coarse(beam(SMALL, damping=DAMPING)))
-    problem.relaxed(problem.positions)  # the longest one, which the other process has no need of
+    problem.relaxed(problem.positions)  # the longest one, which the other process needs last
     step(problem)
     step(pc.discretise(pc.learned_coarse(beam(SMALL, damping=DAMPING))))
 

@@ -206,7 +206,7 @@ ONCE = {
     *((element, "generalised-alpha") for element in ELEMENTS),
     *(("hex8-bubble-mean", integrator) for integrator in INTEGRATORS),
 }
-"""The other pairs are as quick where the linearised step is transposed."""
+"""Elements and integrators, each once: they do not know of each other."""
 PAIRS = [
     pytest.param(*pair, marks=[] if pair in ONCE else [pytest.mark.slow])
     for pair in itertools.product(ELEMENTS, INTEGRATORS)
@@ -420,11 +420,11 @@ def test_where_the_hessian_is_indefinite_a_direct_solution_takes_over():
 
 @pytest.mark.parametrize("solver", ["auto", "direct"])
 def test_where_the_hessian_is_singular_there_is_no_derivative(solver):
-    """A free body in equilibrium, which a force moves any distance."""
-    time = {"step": 0.01, "frames": 3, "integrator": "quasi-static"}
-    problem = pc.discretise(scene(clamps=[], loads=[], time=time))
+    """A free body in equilibrium, with hardly any inertia, which a force moves any distance."""
+    time = {"step": 1e10, "frames": 3, "integrator": "backward-euler"}
+    problem = pc.discretise(scene(clamps=[], loads=[], time=time, material={"density": 1e-6}))
     state = problem.rest_state()
-    result = pc.StepResult(replace(state, time=0.01), pc.Status.CONVERGED, 0, 0.0, 0.0)
+    result = pc.StepResult(replace(state, time=1e10), pc.Status.CONVERGED, 0, 0.0, 0.0)
     g = np.random.default_rng(0).normal(size=state.positions.shape)
     for stepper in (pc.ProjectiveDynamics(problem), pc.Newton(problem)):
         with pytest.raises(ConvergenceError, match="singular"):
@@ -510,8 +510,7 @@ def inputs(case, rng):
     }
 
 
-@pytest.mark.parametrize("integrator", INTEGRATORS)
-@pytest.mark.parametrize("element", ELEMENTS)
+@pytest.mark.parametrize(("element", "integrator"), sorted(ONCE))
 def test_the_adjoint_is_the_transpose_of_the_linearised_step(element, integrator):
     """U . (J w) is (J^T u) . w for all that goes into a step, each by itself."""
     case = linear_case(element, integrator)
@@ -686,8 +685,7 @@ def test_a_result_of_another_step_is_refused_with_what_is_off(element):
         pc.adjoint(stepper, state, result, g, forces=forces[1:])
 
 
-@pytest.mark.parametrize("integrator", [*INTEGRATORS, "quasi-static"])
-@pytest.mark.parametrize("element", ELEMENTS)
+@pytest.mark.parametrize(("element", "integrator"), [*sorted(ONCE), ("hex8", "quasi-static")])
 @pytest.mark.parametrize("offset", [0.0, 100.0])
 def test_no_step_of_any_tolerance_is_refused(element, integrator, offset):
     """Also far from the origin, where positions are rounded more."""

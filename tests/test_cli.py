@@ -165,19 +165,17 @@ def test_a_run_that_fails_keeps_its_frames_and_ends_with_status_1(
 def test_render_draws_runs_side_by_side(program, scene_file, tmp_path):
     for name, solver in (("a", "pd"), ("b", "newton")):
         program(
-            "simulate", scene_file, "-o", tmp_path / f"{name}.h5", "--solver", solver, "--frames", 2
+            "simulate", scene_file, "-o", tmp_path / f"{name}.h5", "--solver", solver, "--frames", 1
         )
     files = (tmp_path / "a.h5", tmp_path / "b.h5")
-    for name in ("still.png", "moving.gif"):
-        status, _, err = program("render", *files, "-o", tmp_path / name)
+    for name, options in (("moving.gif", ()), ("over.png", ("--overlay",))):
+        status, _, err = program("render", *files, "-o", tmp_path / name, *options)
         assert (status, err) == (0, "")
         assert (tmp_path / name).stat().st_size > 5000
     options = ("--colour", "stress", "--camera", "30,-20", "--section", "x=0.02")
     options += ("--warp", 2, "--size", "300x200")
     assert program("render", *files, "-o", tmp_path / "cut.png", *options)[0] == 0
     assert (tmp_path / "cut.png").stat().st_size > 5000
-    assert program("render", *files, "-o", tmp_path / "over.png", "--overlay")[0] == 0
-    assert (tmp_path / "over.png").stat().st_size > 5000
 
 
 def test_doctor_looks_at_everything(program):

@@ -24,7 +24,7 @@ def test_a_body_is_learned_and_the_scene_reads_its_weights(tmp_path):
     ends = [{"region": {"plane": "x", "at": end}} for end in ("min", "max")]
     own = beam((8, 2, 2), clamps=ends, solver={"element": "hex8-enhanced", "mass": "averaged"})
     path = tmp_path / "own.safetensors"
-    found = tune(pc.discretise(own), path, iterations=300, report=lambda _: None)
+    found = tune(pc.discretise(own), path, iterations=120, report=lambda _: None)
     assert found.after["frequencies"] < 0.7 * found.before["frequencies"]
     assert json.loads(path.with_suffix(".json").read_text())["from"] == "released"
     right = pc.modes(pc.discretise(pc.best_coarse(own), 4), 2).frequencies

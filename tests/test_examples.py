@@ -153,8 +153,8 @@ def test_ones_own_body_is_recorded_learned_judged_and_drawn(own, monkeypatch, tm
     splits = dict.fromkeys(("training", "validation", "evaluation"), 1)
     scripts = {  # make_mesh.py has a test of its own, which needs Gmsh
         "material.py": lambda: own("material").fit(OWN / "tensile_test.csv"),
-        "record.py": lambda folder: own("record").main(Path(folder), splits, frames=3, refine=2),
-        "show.py": lambda *paths: own("show").main(*map(Path, paths), Path(), frames=2),
+        "record.py": lambda folder: own("record").main(Path(folder), splits, frames=2, refine=2),
+        "show.py": lambda *paths: own("show").main(*map(Path, paths), Path(), frames=1),
     }
     for line in commands_in_text("bring_your_own.md"):
         if line[0] == "pdcorrect":

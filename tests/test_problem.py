@@ -1,5 +1,8 @@
 """Operators and the discrete problem: conservation, patch tests, loads, clamps, changes."""
 
+import copy
+import pickle
+
 import numpy as np
 import pytest
 from skfem import (
@@ -14,6 +17,7 @@ from skfem import (
 import pdcorrect as pc
 from conftest import beam, cross, disturbed, rotation
 from pdcorrect.errors import InputError, SceneError
+from pdcorrect.fem import internal_modes
 from pdcorrect.fem.elastic_body import ElasticBody
 from pdcorrect.fem.hexahedron import VTK_CORNERS
 from pdcorrect.fem.loads import cofactor, torsion_field
@@ -334,11 +338,23 @@ def test_materials_by_region_reach_their_cells():
 # --- changes ------------------------------------------------------------------------------
 
 
-def test_a_problem_cannot_be_changed_behind_its_factors_back():
-    problem = pc.discretise(beam())
+@pytest.mark.parametrize(
+    "copied", [lambda x: x, copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x))]
+)
+def test_a_problem_cannot_be_changed_behind_its_factors_back(copied):
+    problem = copied(pc.discretise(beam()))
     for array in (problem.positions, problem.free, problem.materials.mu, problem.mass_matrix.data):
         with pytest.raises(ValueError, match="read-only"):
             array[0] = 0
+
+
+def test_kernels_are_not_compiled_anew_for_copies():
+    problem = pc.discretise(pc.best_coarse(beam((2, 1, 1))))
+    problem.relaxed(problem.positions)
+    known = len(internal_modes.relax.signatures)
+    same = copy.deepcopy(problem)
+    same.relaxed(same.positions)
+    assert len(internal_modes.relax.signatures) == known
 
 
 def test_nan_positions_give_nan_energy_and_forces():

@@ -227,7 +227,7 @@ tree = st.recursive(
 )
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=80, deadline=None)
 @given(st.data())
 def test_any_leaf_anywhere_gives_a_scene_or_a_scene_error(data):
     scene = node = tomllib.loads(TEXT)
@@ -248,7 +248,7 @@ def test_any_leaf_anywhere_gives_a_scene_or_a_scene_error(data):
         assert math.isfinite(found.material.young)
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(st.text(max_size=200) | st.builds(lambda i, c: TEXT[:i] + c + TEXT[i + 1 :],
        st.integers(0, len(TEXT) - 1), st.characters()))  # fmt: skip
 def test_any_text_gives_a_scene_or_a_scene_error(text):

@@ -391,7 +391,7 @@ def test_flipped_bytes_give_the_right_data_or_a_refusal(run, saved, tmp_path):
     data = saved.read_bytes()
     path = tmp_path / "flipped.h5"
     chance = random.Random(1)
-    places = [*range(48), *(chance.randrange(len(data)) for _ in range(600))]
+    places = [*range(48), *(chance.randrange(len(data)) for _ in range(200))]
     refused = 0
     for place in places:
         damaged = bytearray(data)
@@ -408,7 +408,7 @@ def test_flipped_bytes_give_the_right_data_or_a_refusal(run, saved, tmp_path):
             except FileFormatError:
                 continue
             assert_same(loaded, run, len(loaded.times))
-    assert refused > 300
+    assert refused > 0.46 * len(places)
 
 
 def test_an_unfinished_file_is_not_held_in_memory_as_well(tmp_path):

@@ -24,7 +24,14 @@ def check(name, quick):
     assert outside(figures, CASES[name].expected, quick) == []
 
 
-@pytest.mark.parametrize("name", QUICK)
+COVERED = {"time_orders", "energy"}
+"""By test_integrators and test_loads_in_time, and by test_energy_balance."""
+
+
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(n, marks=[pytest.mark.slow] if n in COVERED else []) for n in QUICK],
+)
 def test_quick_part(name):
     check(name, quick=True)
 

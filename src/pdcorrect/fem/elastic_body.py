@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
@@ -23,7 +24,7 @@ from pdcorrect.fem.hexahedron import corner_jacobians
 from pdcorrect.fem.internal_modes import Condensed
 from pdcorrect.fem.materials import Materials
 from pdcorrect.fem.mesh import HexMesh
-from pdcorrect.fem.operators import Space
+from pdcorrect.fem.operators import Space, freeze
 from pdcorrect.fem.quadrature import Quadrature
 
 Array = NDArray[np.float64]
@@ -97,6 +98,18 @@ class ElasticBody:
     materials: Materials
     cell_size: float
     correction: CellCorrection | None = field(default=None, kw_only=True)
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._freeze()
+
+    def _freeze(self) -> None:
+        """Make arrays read-only, which those of copies and of unpickled bodies are not."""
+        space, quadrature = self.space, self.quadrature
+        freeze(space.positions, space.cells, space.local)
+        freeze(quadrature.lanes, quadrature.weights, quadrature.volume_weights)
+        if self.correction is not None:
+            freeze(self.correction.cells)
 
     @property
     def positions(self) -> Array:

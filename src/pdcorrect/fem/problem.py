@@ -83,6 +83,12 @@ class Problem(ElasticBody):
             f"{len(self.cells)} {self.element} cells, {self.mass_rule} mass)"
         )
 
+    def _freeze(self) -> None:
+        super()._freeze()
+        materials, mass = self.materials, self.mass_matrix
+        freeze(materials.mu, materials.volume_weight, materials.density)
+        freeze(self.clamps.free, mass.data, mass.indices, mass.indptr)
+
     # --- names of the contract --------------------------------------------------
 
     @property
@@ -338,12 +344,12 @@ def problem_from_body(scene: Scene, refine: int, body: ElasticBody) -> Problem:
         contact = Contact(scene.obstacles, points, space.positions, body.cell_size, young)
     fibres = Fibres.of(scene.actuators, body, selector) if scene.actuators else None
     rollers = Rollers.of(clamps.oblique, body) if clamps.oblique else None
-    freeze(clamps.free, matrix.indices, matrix.indptr)
-    freeze(materials.mu, materials.volume_weight, materials.density, matrix.data)
-    return Problem(
+    problem = Problem(
         body.mesh, space, quadrature, materials, body.cell_size, scene, refine, matrix, clamps,
         loads, contact, fibres, rollers, correction=correction,
     )  # fmt: skip
+    problem._freeze()
+    return problem
 
 
 def _learned(scene: Scene, body: ElasticBody, clamps: Clamps) -> CellCorrection:
