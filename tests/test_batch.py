@@ -16,7 +16,7 @@ from pdcorrect.batch import decomposition, gpu
 from pdcorrect.batch.cells import DistinctBodies
 from pdcorrect.batch.points import Points
 from pdcorrect.batch.triton_kernels import skinny_product
-from pdcorrect.errors import ConvergenceError, InputError
+from pdcorrect.errors import ConvergenceError, InputError, SceneError
 from pdcorrect.fem import energies
 from pdcorrect.fem.decomposition import nearest_volume_lanes
 from pdcorrect.fem.hyperelasticity import energy_code
