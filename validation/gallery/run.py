@@ -13,8 +13,8 @@ import pdcorrect as pc
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 FRAMES = {
-    "lifting_gripper": 30, "crawler": 20, "pressure_finger": 15, "dropped_jelly": 20,
-    "twisted_bar": 40, "bracket": 20,
+    "lifting_gripper": 12, "crawler": 12, "pressure_finger": 6, "dropped_jelly": 9,
+    "twisted_bar": 10, "bracket": 15,
 }  # fmt: skip
 """That converged motions take at most minutes for."""
 MODELS = {"learned": pc.learned_coarse, "best coarse": pc.best_coarse}
