@@ -12,11 +12,8 @@ import common
 import pdcorrect as pc
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
-FRAMES = {
-    "lifting_gripper": 12, "crawler": 12, "pressure_finger": 6, "dropped_jelly": 9,
-    "twisted_bar": 10, "bracket": 15,
-}  # fmt: skip
-"""That converged motions take at most minutes for."""
+FRAMES = {"lifting_gripper": 12, "crawler": 12, "twisted_bar": 10, "bracket": 15}
+"""Few, for converged motions with contact take minutes."""
 MODELS = {"learned": pc.learned_coarse, "best coarse": pc.best_coarse}
 TABLE = "Scenes"
 HEADINGS = (

@@ -11,7 +11,6 @@ import numpy as np
 from crosses import CROSSES
 from diagnosis import ENDS, PARTING, minimum, parting
 from harness import read_expectations
-from obstacles import OBSTACLES
 from scenarios import SCENARIOS, Scenario
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
@@ -33,7 +32,7 @@ Array = np.ndarray
 Row = tuple[float | str, ...]
 
 EXPECTED = read_expectations(Path(__file__).with_name("expected.json"))
-BATTERY = (*SCENARIOS, *OBSTACLES, *CROSSES)
+BATTERY = (*SCENARIOS, *CROSSES)
 MANY = {"Newton": 30}
 """Iterations of a step above which a run that passes is slow; 200 for the others."""
 FALLBACKS = (pc.Status.RECOVERED, pc.Status.SUBSTEPPED)
@@ -126,9 +125,6 @@ def figures_of(
     figures: common.Figures = {**far, f"{name}, status": found.status.name}
     if scenario.known and solver in MODELS:
         figures[f"{name}, accepted"] = found.accepted
-    if scenario.scene.obstacles:
-        figures[f"{name}, smallest gap"] = found.smallest_gap
-        figures[f"{name}, energy gain"] = found.energy_gain
     return figures
 
 

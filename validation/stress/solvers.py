@@ -48,8 +48,6 @@ class Run:
     iterations : list of int
     refused : list of int
         1 where a correction was refused.
-    stats : list of dict
-        Of the steps, see `StepResult`.
     """
 
     problem: pc.Problem
@@ -57,7 +55,6 @@ class Run:
     statuses: list[pc.Status]
     iterations: list[int]
     refused: list[int]
-    stats: list[dict[str, float]]
 
     @property
     def accepted(self) -> float:
@@ -69,19 +66,6 @@ class Run:
         """The last failure, or the status of the last frame."""
         failed = [status for status in self.statuses if not status.ok]
         return failed[-1] if failed else self.statuses[-1]
-
-    @property
-    def smallest_gap(self) -> float:
-        """Between the surface and obstacles in any frame, cells."""
-        return min(step["smallest_gap"] for step in self.stats) / self.problem.cell_size
-
-    @property
-    def energy_gain(self) -> float:
-        """Largest growth of the energy beyond the work of loads and obstacles, of the largest."""
-        names = "kinetic_energy", "elastic_energy", "contact_energy"
-        energy = np.array([sum(step[name] for name in names) for step in self.stats])
-        work = np.array([step["external_work"] + step["obstacle_work"] for step in self.stats])
-        return float((np.diff(energy) - work[1:]).max() / energy.max())
 
     @property
     def least_corner(self) -> float:
@@ -157,7 +141,6 @@ def steps_of(scenario: Scenario, stepper: pc.Stepper) -> Run:
         [r.status for r in results],
         [r.iterations for r in results],
         [int(r.stats.get("refused", 0)) for r in results],
-        [r.stats for r in results],
     )
 
 
@@ -180,5 +163,4 @@ def _batch(scenario: Scenario, problem: pc.Problem) -> Run:
         [r.statuses[0] for r in results],
         [int(r.iterations[0]) for r in results],
         [0] * len(results),
-        [],
     )
