@@ -59,7 +59,10 @@ def time_and_mesh_error() -> Rows:
 def gallery() -> Rows:
     """Scenes of the gallery by two elements."""
     (table,) = read(RECORDS / "gallery.json")["tables"]
-    rows = [[name.replace("_", " "), *map(number, found)] for name, *found, _ in table["rows"]]
+    rows = [
+        [name.replace("_", " "), str(nodes), str(frames), *map(number, found)]
+        for name, nodes, frames, *found, _ in table["rows"]
+    ]
     return table["headings"][:-1], rows
 
 
