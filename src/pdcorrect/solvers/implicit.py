@@ -318,6 +318,8 @@ class ImplicitStepper:
         accelerations = (end.velocities - before.velocities) / part * self.problem.free
         if self.problem.contact is not None:
             loads = loads + contact_forces(self.problem, end, before).sum(axis=0)
+        if self.problem.rollers is not None:
+            loads += self.problem.rollers.forces(end.positions - self.problem.positions, end.time)
         internal = self.problem.mass_times(accelerations) - loads
         known = {
             "accelerations": accelerations,
@@ -364,8 +366,8 @@ def _outcome(
     after = stage.finish(y[:nodes], forces + reaction)
     moved = after.positions - state.positions
     if rollers is not None and objective.attached is not None:
-        pushed = unbalanced * problem.free + objective.attached.end_forces(y)
-        reaction = reaction + pushed - rollers.along(pushed)
+        pushed = unbalanced + objective.attached.end_forces(y)
+        reaction = pushed - rollers.along(pushed * problem.free)
     ends_at_y = stage.gain == 1.0  # otherwise the modes at the end are other ones
     end = y if ends_at_y else problem.relaxed(after.positions)
     attached = [one.energy(end[:nodes] - problem.positions, stage.end) for one in problem.attached]
