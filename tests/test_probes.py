@@ -1,7 +1,9 @@
 """Probes and runs that start from another one's frame: places, interpolation, files, bad input."""
 
 import csv
+import shutil
 
+import h5py
 import numpy as np
 import pytest
 from typer.testing import CliRunner
@@ -45,6 +47,21 @@ def test_quadratic_fields_are_met_exactly_by_cells_with_27_nodes():
     a, b, c = SPOTS[0]
     assert found[0] == pytest.approx(a**2 - 3 * b * c, rel=1e-10)
     assert found[2] == pytest.approx(0.06**2 - 3 * 0.01 * 0.02, rel=1e-10)
+
+
+@pytest.mark.parametrize("shape", ["graded", "tapered"])
+def test_points_of_cells_of_unlike_sizes_are_found(shape):
+    mesh = pc.discretise(beam((4, 4, 4), body={"cell_size": 1.0}, time={"step": 1.0})).mesh
+    x, y, z = mesh.positions.T
+    half = 0.5**z
+    positions = np.stack([x, y, z**4] if shape == "graded" else [x * half, y * half, z], axis=1)
+    rng = np.random.default_rng(3)
+    cells, local = rng.integers(len(mesh.cells), size=200), rng.uniform(size=(200, 3))
+    points = np.einsum("pk,pki->pi", trilinear(local), positions[mesh.cells[cells]])
+    found, places, distances = locate(positions, mesh.cells, points)
+    np.testing.assert_array_equal(found, cells)
+    np.testing.assert_allclose(places, local, atol=1e-9)
+    assert distances.max() < 1e-9
 
 
 def test_points_of_distorted_cells_are_found():
@@ -136,6 +153,13 @@ def test_other_bodies_frames_and_files_are_refused(earlier, tmp_path):
         pc.discretise(probed(initial={"run": str(path), "frame": 7})).initial_state()
     with pytest.raises(SceneError, match=r"initial\.run.*read"):
         pc.discretise(probed(initial={"run": str(tmp_path / "none.h5")})).initial_state()
+    damaged = tmp_path / "damaged.h5"
+    shutil.copy(path, damaged)
+    with h5py.File(damaged, "r+") as file:
+        del file["positions"]
+        file["positions"] = np.zeros((5, 2))
+    with pytest.raises(SceneError, match=r"initial\.run.*read"):
+        pc.discretise(probed(initial={"run": str(damaged)})).initial_state()
     with pytest.raises(SceneError, match="frame"):
         probed(initial={"frame": 1})
     turned = probed(initial={"run": str(path)}, clamps=[{"region": {"plane": "x", "at": "max"}}])
