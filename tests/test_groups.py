@@ -10,7 +10,8 @@ from scipy.spatial import cKDTree
 import pdcorrect as pc
 from conftest import beam, box_mesh
 from pdcorrect.errors import SceneError
-from pdcorrect.fem.mesh import VTK_FACES, Group, refine
+from pdcorrect.fem.hexahedron import VTK_FACES
+from pdcorrect.fem.mesh import Group, refine
 
 NONE = np.zeros(0, np.int64)
 MESH = box_mesh((3, 2, 2), (0.3, 0.2, 0.2), distortion=0.2)

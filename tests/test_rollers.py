@@ -101,6 +101,11 @@ def test_rollers_hold_statics_or_are_missed():
         pc.Newton(pc.discretise(scene.with_changes(clamps=corner + more)))
 
 
+def test_scenes_with_rollers_are_read_again():
+    scene = beam(clamps=[{"region": {"plane": "x", "at": "min"}, "normal": [1, 0, 1]}])
+    assert pc.Scene.from_toml(scene.to_toml()) == scene
+
+
 def test_wrong_rollers_are_refused():
     for clamp, key in (
         ({"normal": [0, 0, 0]}, "normal"),
