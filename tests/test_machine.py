@@ -2,9 +2,12 @@
 
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
+from threading import Event
 
 import numba
 import pytest
+from threadpoolctl import threadpool_info, threadpool_limits
 
 import pdcorrect as pc
 from conftest import beam
@@ -40,6 +43,27 @@ def test_only_large_problems_take_all_threads_and_give_them_back(monkeypatch, fe
     stepper = pc.Newton(pc.discretise(beam((2, 1, 1))))
     stepper(stepper.problem.rest_state())
     assert used == ([1, most] if few else [most])
+
+
+def test_blas_has_its_threads_back_after_steps_in_several():
+    def blas():
+        return [info["num_threads"] for info in threadpool_info() if info["user_api"] == "blas"]
+
+    problem, entered, joined = pc.discretise(beam((2, 1, 1))), Event(), Event()
+
+    def step():
+        with implicit.limited_threads(problem):
+            entered.set()
+            joined.wait()
+
+    with threadpool_limits(2, "blas"), ThreadPoolExecutor() as pool:
+        other = pool.submit(step)
+        entered.wait()
+        with implicit.limited_threads(problem):
+            joined.set()
+            other.result()
+            assert set(blas()) == {1}
+        assert set(blas()) == {2}
 
 
 @pytest.mark.parametrize("command", ["simulate", "compare"])

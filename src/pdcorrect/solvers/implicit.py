@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -402,6 +403,27 @@ def _threadpools() -> ThreadpoolController:
     return ThreadpoolController()
 
 
+class _OneThread:
+    """BLAS on one thread, as long as any Python thread is inside; as it was after the last."""
+
+    _lock, _inside, _limit = threading.Lock(), 0, None
+
+    def __enter__(self) -> None:
+        with self._lock:
+            if not self._inside:
+                self._limit = _threadpools().limit(limits=1, user_api="blas")
+            self._inside += 1
+
+    def __exit__(self, *error: object) -> None:
+        with self._lock:
+            self._inside -= 1
+            if not self._inside and self._limit is not None:
+                self._limit.restore_original_limits()
+
+
+_one_blas_thread = _OneThread()
+
+
 @contextmanager
 def limited_threads(problem: Problem) -> Iterator[None]:
     """BLAS on one thread, and the kernels of small problems too.
@@ -411,7 +433,7 @@ def limited_threads(problem: Problem) -> Iterator[None]:
     another program has its core (``benchmarks``, case threads).
     """
     before = numba.get_num_threads()
-    with _threadpools().limit(limits=1, user_api="blas"):
+    with _one_blas_thread:
         if problem.quadrature.weights.size < _SHARED_POINTS:
             numba.set_num_threads(1)
         try:
