@@ -1,13 +1,12 @@
 """Machines that keep no files, have few threads, or are busy."""
 
+import os
 import subprocess
 import sys
-from concurrent.futures import ThreadPoolExecutor
-from threading import Event
+from pathlib import Path
 
 import numba
 import pytest
-from threadpoolctl import threadpool_info, threadpool_limits
 
 import pdcorrect as pc
 from conftest import beam
@@ -45,25 +44,37 @@ def test_only_large_problems_take_all_threads_and_give_them_back(monkeypatch, fe
     assert used == ([1, most] if few else [most])
 
 
-def test_blas_has_its_threads_back_after_steps_in_several():
-    def blas():
-        return [info["num_threads"] for info in threadpool_info() if info["user_api"] == "blas"]
+STEPS_IN_TWO_THREADS = """
+from threading import Event, Thread
+import pdcorrect as pc
+from conftest import beam
+from pdcorrect.solvers.implicit import limited_threads
+from threadpoolctl import threadpool_info
 
-    problem, entered, joined = pc.discretise(beam((2, 1, 1))), Event(), Event()
+def blas():
+    return [info["num_threads"] for info in threadpool_info() if info["user_api"] == "blas"]
 
-    def step():
-        with implicit.limited_threads(problem):
-            entered.set()
-            joined.wait()
+def step():
+    with limited_threads(problem):
+        entered.set()
+        joined.wait()
 
-    with threadpool_limits(2, "blas"), ThreadPoolExecutor() as pool:
-        other = pool.submit(step)
-        entered.wait()
-        with implicit.limited_threads(problem):
-            joined.set()
-            other.result()
-            assert set(blas()) == {1}
-        assert set(blas()) == {2}
+problem, entered, joined, before = pc.discretise(beam((2, 1, 1))), Event(), Event(), blas()
+other = Thread(target=step)
+other.start()
+entered.wait()
+with limited_threads(problem):
+    joined.set()
+    other.join()
+    assert set(blas()) == {1}
+assert blas() == before, before
+"""
+
+
+def test_blas_has_its_threads_back_after_steps_in_two():
+    paths = os.pathsep.join([str(Path(__file__).parent), *sys.path])
+    settings = {**os.environ, "OPENBLAS_NUM_THREADS": "2", "PYTHONPATH": paths}
+    subprocess.run([sys.executable, "-c", STEPS_IN_TWO_THREADS], check=True, env=settings)
 
 
 @pytest.mark.parametrize("command", ["simulate", "compare"])
