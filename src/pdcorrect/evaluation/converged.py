@@ -149,6 +149,10 @@ def _key(scene: Scene) -> str:
         for name, group in sorted(mesh.groups.items()):
             content += repr((name, *(own.tolist() for own in group))).encode()
         scene = scene.with_changes(body={"path": f"mesh{scene.body.path.suffix}"})
+    for named in (getattr(scene.body, "given", None), scene.initial and scene.initial.run):
+        if isinstance(named, Path):
+            with contextlib.suppress(OSError):  # discretise says what is wrong
+                content += named.read_bytes()
     parts = (
         scene.with_changes(name="scene").to_toml().encode(),
         content,
