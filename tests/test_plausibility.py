@@ -127,3 +127,4 @@ def test_inverted_frames_end_with_status_1_unless_allowed(tmp_path, options, sta
     run = pc.load_trajectory(output)
     assert np.min(run.stats["smallest_volume_ratio"]) <= 0
     assert done.exit_code == status
+    assert CliRunner().invoke(app, [*command, "--resume"]).exit_code == status

@@ -95,6 +95,15 @@ def test_simulate_writes_a_table(tmp_path):
     assert moved["end"][-1, 2] < 0
 
 
+def test_a_probe_outside_is_told_before_the_run(tmp_path):
+    scene = probed(probes=[{"name": "a", "point": [9, 0, 0]}], time={"step": 0.01, "frames": 2})
+    (tmp_path / "scene.toml").write_text(scene.to_toml())
+    output = tmp_path / "run.h5"
+    done = CliRunner().invoke(app, ["simulate", str(tmp_path / "scene.toml"), "-o", str(output)])
+    assert isinstance(done.exception, SceneError) or done.exit_code == 2
+    assert not output.exists()
+
+
 @pytest.mark.parametrize(
     ("change", "key"),
     [
@@ -204,8 +213,9 @@ def test_voxels_come_from_numpy_files(tmp_path):
             pc.discretise(
                 pc.Scene(**scene | {"body": {**body, "occupancy": str(tmp_path / f"{name}.npy")}})
             )
-    (tmp_path / "text.npy").write_text("no array")
-    with pytest.raises(SceneError, match=r"body\.occupancy.*read"):
-        pc.discretise(
-            pc.Scene(**scene | {"body": {**body, "occupancy": str(tmp_path / "text.npy")}})
-        )
+    for content in (b"no array", b"\x93NUMPY\x01\x00\x05\x00{{{{\n"):
+        (tmp_path / "text.npy").write_bytes(content)
+        with pytest.raises(SceneError, match=r"body\.occupancy.*read"):
+            pc.discretise(
+                pc.Scene(**scene | {"body": {**body, "occupancy": str(tmp_path / "text.npy")}})
+            )

@@ -68,6 +68,10 @@ def simulate(
         make_folder(vtu)
     common.tell_of_compiling()
     stepper = _make_stepper(loaded, solver, refine, learned, model, gate)
+    if loaded.probes:
+        from pdcorrect.fem.probes import probe_weights
+
+        probe_weights(stepper.problem)  # what is wrong is told before the run
     origin = getattr(stepper, "origin", None)
     if origin:
         told = "model {model} on the base {base}, trained on {dataset} with {trained_integrator}"
@@ -75,13 +79,14 @@ def simulate(
     count = frames or loaded.time.frames
     earlier = _frames_so_far(output, stepper, count) if resume else None
     before = 0 if earlier is None else len(earlier)
-    inverted = ""
-    if before < count:
+    if earlier is None or before < count:
         stats = _run(stepper, count, output, earlier, overwrite).arrays()
         _summary(stats, stepper, before)
-        inverted = inverted_frames(stats, loaded.time.step)
-        common.say(inverted)
         common.say(f"wrote {output}")
+    else:
+        stats = earlier.stats
+    inverted = inverted_frames(stats, loaded.time.step)
+    common.say(inverted)
     if loaded.probes:
         from pdcorrect.io.probes import write_probes
 
