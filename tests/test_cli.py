@@ -22,6 +22,13 @@ def scene_file(tmp_path):
     return path
 
 
+def test_the_version_is_told(program):
+    module = [sys.executable, "-m", "pdcorrect", "--version"]
+    told = subprocess.run(module, capture_output=True, text=True, check=True).stdout
+    assert program("--version") == (0, told, "")
+    assert told.strip() == pc.__version__
+
+
 def test_simulate_writes_the_rollout(program, scene_file, tmp_path):
     output = tmp_path / "run.h5"
     status, out, err = program("simulate", scene_file, "-o", output)
@@ -121,6 +128,12 @@ def test_bad_scenes_end_with_status_2_and_one_paragraph(
         ("render run.h5 -o x.gif --frame 1", "--frame"),
         ("render run.h5 -o x.png --frame 99", "99"),
         ("render run.h5 -o x.bmp2", "x.bmp2"),
+        ("render run.h5 -o x.png --camera north", "north"),
+        ("render run.h5 -o x.png --camera 1,2,3", "--camera 1,2,3"),
+        ("render run.h5 -o x.png --section x", "--section x"),
+        ("render run.h5 -o x.png --section x=99", "x = 99"),
+        ("render run.h5 -o x.png --size 100", "--size 100"),
+        ("render run.h5 run.h5 -o x.png --overlay --warp 2", "--warp"),
         ("frobnicate", "frobnicate"),
     ],
 )
@@ -166,6 +179,10 @@ def test_render_draws_runs_side_by_side(program, scene_file, tmp_path):
         status, _, err = program("render", *files, "-o", tmp_path / name, *options)
         assert (status, err) == (0, "")
         assert (tmp_path / name).stat().st_size > 5000
+    options = ("--colour", "stress", "--camera", "30,-20", "--section", "x=0.02")
+    options += ("--warp", 2, "--size", "300x200")
+    assert program("render", *files, "-o", tmp_path / "cut.png", *options)[0] == 0
+    assert (tmp_path / "cut.png").stat().st_size > 5000
 
 
 def test_doctor_looks_at_everything(program):
@@ -176,7 +193,7 @@ def test_doctor_looks_at_everything(program):
 
 
 def test_help_names_every_command_and_each_has_its_own(program):
-    commands = ("simulate", "compare", "render", "export", "train", "evaluate", "validate",
+    commands = ("simulate", "compare", "render", "view", "export", "train", "evaluate", "validate",
                 "dataset", "doctor")  # fmt: skip
     status, out, _ = program("--help")
     assert status == 0
@@ -200,6 +217,7 @@ def test_outputs_that_cannot_be_written_are_named_before_the_work(
         (("simulate", scene_file, "-o", "/proc/nowhere/run.h5"), "run.h5"),
         (("simulate", scene_file, "-o", tmp_path / "a.h5", "--vtu", tmp_path / "file"), "file"),
         (("compare", scene_file, "-o", tmp_path / "file"), "file"),
+        (("simulate", scene_file, "-o", tmp_path / "x.h5", "--report", tmp_path / "file"), "file"),
         (("compare", scene_file, "-o", tmp_path / "r", "--vtu", "--no-figures"), "vtu"),
     ):
         status, out, err = program(*arguments)

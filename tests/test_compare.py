@@ -1,8 +1,10 @@
 """`compare`: its cases, their reference, what fails or is refused, and what it writes."""
 
+import base64
 import csv
 import dataclasses
 import json
+import re
 import sys
 from pathlib import Path
 
@@ -213,7 +215,7 @@ def test_a_row_whose_corrections_are_all_refused_is_the_base_and_says_so(stiff, 
     name = f"hybrid {MODEL} (all refused)"
     assert [line["solver"] for line in report.table(found)] == ["coarse PD as trained", name]
     assert any(f"{hybrid.label}: " in note and "2 of 2" in note for note in notes(found))
-    assert f"| {name} |" in report.write_report(found, tmp_path, draw=False).read_text()
+    assert f"<td>{name}</td>" in report.write_report(found, tmp_path, draw=False).read_text()
     np.testing.assert_array_equal(
         found.runs[hybrid.label].positions, found.runs[coarse.label].positions
     )
@@ -316,18 +318,15 @@ def test_errors_to_the_converged_motion_come_first(program, thick, tmp_path, mon
     truth = pc.converged(scene)
     own = pc.rollout(pc.ProjectiveDynamics(pc.discretise(scene)))
     assert errors["coarse PD"] == pytest.approx(pc.metrics.relative_error(own, truth), rel=1e-9)
-    lines = (folder / "report.md").read_text().splitlines()
-    (header,) = [line for line in lines if line.startswith("| solver")]
-    assert [x.strip() for x in header.split("|")[1:5]] == [
-        "solver", "estimated", "error", "RMS mm"
-    ]  # fmt: skip
+    text = (folder / "index.html").read_text()
+    assert re.findall("<th>(.*?)</th>", text)[:4] == ["solver", "estimated", "error", "RMS mm"]
     for label in ("coarse PD", "best coarse PD"):
         assert 0.5 < float(rows[label]["estimated_error"]) / errors[label] < 2.0
     assert not rows["fine best PD"]["estimated_error"]
     record = json.loads((folder / "report.json").read_text())
     assert {"time_error", "mesh_error"} <= set(record["converged"])
     shown = f"{report.three_digits(100 * errors['coarse PD'])} %"
-    assert any(line.startswith("| coarse PD |") and shown in line for line in lines)
+    assert re.search(f"<td>coarse PD</td>.*<td>{shown}</td>", text)
     assert shown in out
     assert (folder / "error_over_time.png").stat().st_size > 5000
 
@@ -402,6 +401,11 @@ def test_correctors_of_one_name_are_told_apart_and_cases_of_one_label_refused(tm
         pc.compare(beam((2, 1, 1)), cases=CASES[2:3] * 2)
 
 
+def test_comparisons_of_no_frames_are_refused():
+    with pytest.raises(InputError, match="frames = 0"):
+        pc.compare(beam((2, 1, 1)), 0)
+
+
 def test_a_base_is_known():
     scene, case = beam((2, 1, 1)), CASES[1]
     with pytest.raises(InputError, match="base 'worst'"):
@@ -417,6 +421,7 @@ def test_a_base_is_known():
 def test_compare_writes_its_report(program, tmp_path):
     scene = tmp_path / "cross.toml"
     scene.write_text(beam((4, 2, 2), solver={"tolerance": 1e-4}).to_toml())
+    Image = pytest.importorskip("PIL.Image")
     folder = tmp_path / "report"
     status, out, _ = program("compare", scene, "-o", folder, "--frames", 2)
     assert status == 0
@@ -434,13 +439,36 @@ def test_compare_writes_its_report(program, tmp_path):
     assert 0 < record["solver_error"] < 1e-2 * errors[0]
     assert all(row["unusual_frames"] == 0 for row in record["rows"])
     assert record["environment"]["threads"]
-    text = (folder / "report.md").read_text()
-    for name in ("comparison.png", "overlay.png", "node.png", "energy.png", "error_over_time.png"):
-        assert f"]({name})" in text
+    text = (folder / "index.html").read_text()
+    assert not re.search("<script|https?://", text)
+    for name in (
+        "motion.gif", "comparison.png", "overlay.png", "node.png", "energy.png",
+        "error_over_time.png", "error_against_time.png",
+    ):  # fmt: skip
+        assert base64.b64encode((folder / name).read_bytes()).decode() in text
         assert (folder / name).stat().st_size > 5000
+    with Image.open(folder / "motion.gif") as film:
+        assert film.n_frames == 3
     for label in rows:
         assert label in out
-        assert f"| {label} |" in text
+        assert f"<td>{label}</td>" in text
+
+
+def test_simulate_writes_a_page_about_its_run(program, tmp_path):
+    pytest.importorskip("pyvista")
+    scene, folder = tmp_path / "scene.toml", tmp_path / "report"
+    probes = [{"name": "tip <1>", "point": [0.16, 0.0, 0.0]}]
+    scene.write_text(beam((4, 2, 2), 0.04, name="a & b", probes=probes).to_toml())
+    output = ("-o", tmp_path / "run.h5", "--frames", 2)
+    assert program("simulate", scene, *output, "--report", folder)[0] == 0
+    text = (folder / "index.html").read_text()
+    assert "<h1>a &amp; b</h1>" in text
+    assert "probe tip &lt;1&gt;" in text
+    for name in ("motion.gif", "probe_0.png", "energy.png"):
+        assert base64.b64encode((folder / name).read_bytes()).decode() in text
+    (folder / "index.html").unlink()
+    assert program("simulate", scene, *output, "--resume", "--report", folder)[0] == 0
+    assert (folder / "index.html").exists()
 
 
 def failing_after_a_step(monkeypatch, kind, nodes, element="hex8"):
@@ -481,7 +509,8 @@ def test_compare_goes_on_after_a_case_that_fails(
     record = json.loads((folder / "report.json").read_text())
     assert list(record["failures"]) == [failing]
     assert (record["solver_error"] is None) == (failing == "coarse PD")
-    assert f"| {failing} | failed |" in (folder / "report.md").read_text()
+    text = (folder / "index.html").read_text()
+    assert f"<td>{failing}</td><td>failed</td>" in text
     assert f"{failing} failed: frame 2" in " ".join(out.split())
     assert not drawn or (folder / "comparison.png").stat().st_size > 5000
 
@@ -492,7 +521,7 @@ def test_compare_ends_where_its_reference_fails(program, scene_file, tmp_path, m
     status, _, err = program("compare", scene_file, "-o", tmp_path / "report")
     assert status == FAILED
     assert "frame 2 (t = 0.02 s) failed" in err
-    assert not (tmp_path / "report" / "report.md").exists()
+    assert not (tmp_path / "report" / "index.html").exists()
 
 
 def test_a_report_of_a_reference_alone_has_no_plots_of_errors(tmp_path, monkeypatch):
@@ -504,8 +533,8 @@ def test_a_report_of_a_reference_alone_has_no_plots_of_errors(tmp_path, monkeypa
     assert [row.label for row in found.rows] == ["fine PD"]
     assert list(found.failures) == ["coarse Newton", "coarse PD", "intermediate PD"]
     text = report.write_report(found, tmp_path).read_text()
-    assert "](comparison.png)" in text
-    assert "](error_" not in text
+    assert 'id="comparison"' in text
+    assert 'id="error_' not in text
     assert not list(tmp_path.glob("error_*.png"))
 
 

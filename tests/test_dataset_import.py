@@ -13,7 +13,7 @@ from pdcorrect.data.check import check_dataset
 from pdcorrect.data.import_files import import_trajectories, shard_from_trajectories
 from pdcorrect.data.importing import ImportedMotion, shard_from_arrays
 from pdcorrect.data.schema import read_shard, write_shard
-from pdcorrect.errors import FileFormatError, InputError, MeshError
+from pdcorrect.errors import FileFormatError, InputError, MeshError, PdcorrectWarning
 from pdcorrect.fem.hexahedron import gauss_points, jacobians
 from pdcorrect.scene import trained_coarse
 from pdcorrect.solvers.rollout import restrict
@@ -421,6 +421,11 @@ def test_data_sets_neither_take_imports_nor_are_imported(tmp_path):
     with pytest.raises(InputError, match=r"config\.toml"):
         import_trajectories([source], tmp_path, split="extra")
     assert not (tmp_path / "extra").exists()
+    for split in ("", "..", "a/b"):
+        with pytest.raises(InputError, match="split"):
+            import_trajectories([source], tmp_path / "new", split=split)
+    with pytest.warns(PdcorrectWarning, match="split 'own'"):
+        import_trajectories([source], tmp_path / "new", split="own")
     root = samples.write(tmp_path / "set", [samples.shard(steps=(3,))])
     with pytest.raises(FileFormatError, match=r"mesh-0000\.h5"):
         import_trajectories([root / "training/mesh-0000.h5"], tmp_path / "other")

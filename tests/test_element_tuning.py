@@ -127,6 +127,10 @@ def test_bodies_that_cannot_be_learned_are_refused(changes, message):
 def test_other_names_of_the_file_are_refused(tmp_path):
     with pytest.raises(InputError, match="safetensors"):
         tune(pc.discretise(scene()), tmp_path / "own.json")
+    (tmp_path / "own.safetensors").write_text("precious")
+    with pytest.raises(OutputError, match="exists"):
+        tune(pc.discretise(scene()), tmp_path / "own.safetensors")
+    assert (tmp_path / "own.safetensors").read_text() == "precious"
 
 
 def test_cells_off_the_grid_are_refused():

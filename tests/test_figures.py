@@ -7,10 +7,14 @@ import warnings
 import numpy as np
 import pytest
 
+import pdcorrect as pc
+from conftest import beam
 from motion import trajectory
 from pdcorrect import figures
 from pdcorrect.errors import InputError, MeshError, MissingExtraError, OutputError
-from pdcorrect.figures import curves
+from pdcorrect.fem.stress import von_mises
+from pdcorrect.figures import curves, fields, panels
+from pdcorrect.figures.obstacles import Surface, obstacles_of
 
 pytest.importorskip("pyvista")
 pytest.importorskip("matplotlib")
@@ -144,7 +148,7 @@ def test_the_error_of_the_reference_is_nothing(run, fine, tmp_path):
 def test_errors_are_distances_at_coincident_nodes(run, fine):
     for shown, reference in ((run, fine), (fine, run)):
         frames = np.arange(7)
-        body = figures._body(shown, frames, "error", reference, frames)
+        body = fields.body_of(shown, frames, "error", reference, frames)
         points = [tuple(np.round(p, 9)) for p in body.run.points]
         assert len(points) == len(run.points)
         for run_here, positions in ((shown, body.run.positions), (reference, None)):
@@ -231,7 +235,11 @@ def test_bad_input_is_refused_by_name_and_value(run, fine, tmp_path):
         (figures.render, run, png, {"frame": 7}, "frame 7: .*-7 to 6"),
         (figures.render, run, png, {"frame": [0, -8]}, "frame -8: .*-7 to 6"),
         (figures.render, run, png, {"frame": []}, "frame"),
-        (figures.render, run, png, {"colour": "stress"}, "'stress'"),
+        (figures.render, run, png, {"colour": "speed"}, "'speed'"),
+        (figures.render, run, png, {"camera": "north"}, "'north'"),
+        (figures.render, run, png, {"section": ("w", 0.1)}, "'w'"),
+        (figures.render, run, png, {"section": ("x", 9.0)}, "x = 9"),
+        (figures.render, run, png, {"size": (300, 40)}, "300, 40"),
         (figures.render, run, png, {"colour": "error"}, "reference"),
         (figures.render, run, gif, {"fps": 0.0}, "fps"),
         (figures.render_overlay, [run], png, {"labels": ["a"]}, "1 run"),
@@ -250,19 +258,23 @@ def test_bad_input_is_refused_by_name_and_value(run, fine, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_runs_over_each_other_are_seen_where_they_differ(run, fine, tmp_path):
-    """Blue and green alone where one body is, and a mixture of both where they are together."""
+def test_runs_over_each_other_have_the_colours_of_the_legend(run, fine, tmp_path):
     away = dataclasses.replace(run, positions=run.positions + np.array([0.0, 0.0, 0.05]))
-    pictures = [
-        drawn(figures.render_overlay(runs, tmp_path / "a.png", labels=["1", "2"], window=WIDTH))
-        for runs in ([run, run], [run, away])
-    ]
-    shades = [image[body_rows(image)].transpose(2, 0, 1) for image in pictures]
-    blue = [((b - r > 60) & (b - g > 25)).mean() for r, g, b in shades]
-    green = [((g - r > 60) & (g - b > 25)).mean() for r, g, b in shades]
-    for shares in (blue, green):
-        assert shares[0] < 0.01
-        assert shares[1] > 0.03
+    three = [run, away, trajectory(frames=6, angle=-0.9)]
+    image = drawn(
+        figures.render_overlay(three, tmp_path / "a.png", labels=["1", "2", "3"], window=WIDTH)
+    )
+    legend = image[-40:, 150:].reshape(-1, 3)
+    keys = [pixel for pixel in np.unique(legend, axis=0) if (legend == pixel).all(1).sum() > 10]
+    hued = [key for key in keys if np.ptp(key) > 60]
+    assert len(hued) == 2
+    pixels = image[:-40].reshape(-1, 3)
+    pixels = pixels[np.ptp(pixels, axis=1) > 90]
+    near = [np.abs(pixels - key).max(axis=1) < 30 for key in hued]
+    assert all(each.sum() > 100 for each in near)
+    # all others are edges of lines: as the key is, with some white or grey
+    hue = [np.argsort(key).tolist() for key in hued]
+    assert all(np.argsort(pixel).tolist() in hue for pixel in pixels[~np.any(near, axis=0)])
     for label in ("1", "x" * 90):
         path = figures.render_overlay([run, run], tmp_path / "c.png", labels=[label, "last"])
         legend = drawn(path)[-60:]
@@ -271,6 +283,105 @@ def test_runs_over_each_other_are_seen_where_they_differ(run, fine, tmp_path):
         assert paper(legend[:, -5:]).all()
     # of a finer run, the coarse one's cells
     assert figures.render_overlay([run, fine], tmp_path / "b.png", labels=["1", "2"]).exists()
+
+
+def test_a_picture_has_the_size_that_is_asked_for(run, tmp_path):
+    image = drawn(figures.render([run, run], tmp_path / "a.png", size=(501, 333)))
+    assert image.shape[:2] == (333, 501)
+    film = iio.imread(figures.render(run, tmp_path / "a.gif", size=(202, 260), frame=[0, 6]))
+    assert film.shape[:3] == (2, 260, 202)
+
+
+def height_over_width(image):
+    rows = bodies(image)[: body_rows(image).stop]
+    return np.ptp(np.flatnonzero(rows.any(1))) / np.ptp(np.flatnonzero(rows.any(0)))
+
+
+@pytest.mark.parametrize(
+    ("camera", "across", "up"),
+    [("x", 1, 2), ("y", 0, 2), ("z", 0, 1), ((-90.0, 0.0), 0, 2), ((0.0, 0.0), 1, 2)],
+)
+def test_cameras_look_along_axes(run, tmp_path, camera, across, up):
+    path = figures.render(run, tmp_path / "a.png", camera=camera, frame=0, window=WIDTH)
+    length = np.ptp(run.points, axis=0)
+    assert height_over_width(drawn(path)) == pytest.approx(length[up] / length[across], rel=0.06)
+
+
+def test_warped_bodies_move_so_many_times_as_far(run, tmp_path):
+    far = dataclasses.replace(run, positions=run.points + 3.0 * (run.positions - run.points))
+    pictures = [
+        drawn(figures.render(one, tmp_path / "a.png", colour=None, warp=warp, window=WIDTH))
+        for one, warp in ((run, 3.0), (far, 1.0))
+    ]
+    np.testing.assert_array_equal(*pictures)
+
+
+@pytest.mark.parametrize("towards", [1.0, -1.0])
+def test_sections_leave_out_what_is_before_them(run, towards):
+    axes = panels.camera_axes((0.0 if towards > 0 else 180.0, 0.0))
+    body = fields.body_of(run, np.arange(7), "displacement").cut(0, 0.15, axes)
+    left = body.run.points[body.run.cells].mean(axis=1)[:, 0]
+    whole = run.points[run.cells].mean(axis=1)[:, 0]
+    assert len(left) == (whole < 0.15).sum() if towards > 0 else (whole > 0.15).sum()
+    assert (towards * left < towards * 0.15).all()
+    moved = np.linalg.norm(body.positions - body.run.points, axis=2)
+    np.testing.assert_allclose(body.values, moved)
+
+
+@pytest.fixture(scope="module")
+def fallen():
+    """A cube in the air above and beside one obstacle of each shape, one of them moving."""
+    obstacles = [
+        {"shape": "plane", "point": [0.0, 0.0, -0.05], "normal": [0.0, 0.0, 1.0]},
+        {"shape": "sphere", "centre": [0.2, 0.0, 0.0], "radius": 0.04},
+        {"shape": "cylinder", "centre": [-0.1, 0.0, 0.0], "axis": [0.0, 1.0, 0.0], "radius": 0.03},
+        {"shape": "box", "box": [[0.0, 0.2, 0.0], [0.1, 0.25, 0.1]],
+         "motion": {"times": [0.0, 0.02], "displacement": [[0.0, 0.0, 0.0], [0.0, 0.0, 0.06]]}},
+    ]  # fmt: skip
+    scene = beam((2, 2, 2), 0.05, clamps=[], obstacles=obstacles)
+    return pc.rollout(pc.ProjectiveDynamics(pc.discretise(scene)), frames=2)
+
+
+def test_obstacles_are_drawn_where_they_are(fallen, tmp_path):
+    names = {type(one.declared).__name__ for one in obstacles_of(fallen)}
+    assert names == {"Plane", "Sphere", "Cylinder", "Box"}
+    *_, box = (Surface(one, np.zeros(3), 0.2) for one in obstacles_of(fallen))
+    for time, height in ((0.0, 0.0), (0.01, 0.03), (0.02, 0.06)):
+        assert box.points(time)[:, 2].min() == pytest.approx(height)
+    pc.save_trajectory(tmp_path / "run.h5", fallen)
+    again = pc.load_trajectory(tmp_path / "run.h5")
+    bare = dataclasses.replace(again, scene_toml="")
+    size = {"size": (300, 300), "camera": "iso"}
+    with_them = drawn(figures.render(again, tmp_path / "a.png", **size))
+    without = drawn(figures.render(bare, tmp_path / "b.png", **size))
+    grey = [(~paper(image) & ~bodies(image)).mean() for image in (without, with_them)]
+    assert grey[1] > grey[0] + 0.1
+
+
+def test_planes_and_endless_bars_stay_beside_the_body(fallen):
+    middle = np.array([3.0, -2.0, 5.0])
+    plane, _, bar, _ = (Surface(one, middle, 0.2) for one in obstacles_of(fallen))
+    np.testing.assert_allclose(plane.points(0.0).mean(axis=0), [3.0, -2.0, -0.05], atol=1e-6)
+    low, high = bar.points(0.0).min(axis=0), bar.points(0.0).max(axis=0)
+    np.testing.assert_allclose(0.5 * (low + high), [-0.1, -2.0, 0.0], atol=1e-6)
+
+
+def test_stress_and_volume_are_those_of_the_energy(fallen, tmp_path):
+    stretched = dataclasses.replace(fallen, positions=fallen.positions * [1.1, 1.0, 1.0])
+    frames = np.arange(3)
+    ratios = fields.nodal_values(stretched, frames, "volume")
+    np.testing.assert_allclose(ratios, 1.1, rtol=1e-3)
+    found = fields.nodal_values(stretched, frames, "stress")
+    cauchy = pc.stress(fallen.problem, stretched.positions[1]).nodal_cauchy
+    np.testing.assert_allclose(found[1], von_mises(cauchy))
+    for colour in ("stress", "volume"):
+        image = drawn(figures.render(stretched, tmp_path / "a.png", colour=colour, window=WIDTH))
+        assert bodies(image).mean() > 0.03
+    with pytest.raises(InputError, match="no scene"):
+        figures.render(
+            dataclasses.replace(fallen, scene_toml="", problem=None), tmp_path / "b.png",
+            colour="stress",
+        )  # fmt: skip
 
 
 def test_unwritable_outputs_and_missing_libraries_are_named(run, tmp_path, monkeypatch):
@@ -354,6 +465,21 @@ def test_error_curves(run, tmp_path, monkeypatch):
         figures.plot_error_over_time(errors, run.times[1:], tmp_path / "a.png")
 
 
+def test_many_curves_stay_apart(run, tmp_path, monkeypatch):
+    looks = []
+
+    def save(figure, output):
+        for line in figure.axes[0].get_lines():
+            looks.append((line.get_color(), line.get_linestyle(), line.get_marker()))
+
+    monkeypatch.setattr(curves, "_save", save)
+    figures.plot_energy([run] * 16, tmp_path / "a.png", labels=list("abcdefghijklmnop"))
+    assert len(set(looks)) == 16
+    for first in range(9):  # of eight neighbours none shares colour and line, or the mark
+        eight = looks[first : first + 8]
+        assert len({look[:2] for look in eight}) == len({look[2] for look in eight}) == 8
+
+
 def test_curves_refuse_bad_arguments(run, tmp_path):
     with pytest.raises(InputError, match="labels"):
         figures.plot_energy([run], tmp_path / "a.png", labels=["a", "b"])
@@ -384,6 +510,14 @@ def test_drawing_is_probed_in_another_process(monkeypatch):
     assert "libegl1" in figures.check_offscreen()
     monkeypatch.setattr("pdcorrect.figures.panels._PROBE", "import time; time.sleep(30)")
     assert "no answer in 0.5 s" in figures.check_offscreen(timeout=0.5)
+
+
+def test_an_x_window_that_cannot_be_opened_is_told_before_it_crashes(monkeypatch, tmp_path):
+    monkeypatch.setenv("VTK_DEFAULT_OPENGL_WINDOW", "vtkXOpenGLRenderWindow")
+    monkeypatch.delenv("DISPLAY", raising=False)
+    with pytest.raises(OutputError, match="VTK_DEFAULT_OPENGL_WINDOW"):
+        figures.render(trajectory(), tmp_path / "run.png")
+    assert not list(tmp_path.iterdir())
 
 
 def test_short_times_are_told_in_a_unit_that_shows_them():

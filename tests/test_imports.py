@@ -13,7 +13,7 @@ SOURCE = ROOT / "src" / "pdcorrect"
 TINY = ROOT / "datasets" / "tiny"
 LAYERS = [
     "_version", "errors", "_config", "_files", "_environment", "state", "scene", "fem",
-    "trajectory", "solvers", "metrics", "figures", "io", "batch", "corrector", "data", "elements",
+    "trajectory", "solvers", "metrics", "io", "figures", "batch", "corrector", "data", "elements",
     "evaluation", "training", "cli", "__main__",
 ]  # fmt: skip
 """From the ground up: a folder, or module beside the folders, imports from those before it."""

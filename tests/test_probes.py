@@ -174,6 +174,8 @@ def test_other_bodies_frames_and_files_are_refused(earlier, tmp_path):
     turned = probed(initial={"run": str(path)}, clamps=[{"region": {"plane": "x", "at": "max"}}])
     with pytest.warns(PdcorrectWarning, match="jump"):
         pc.discretise(turned).initial_state()
+    with pytest.warns(PdcorrectWarning, match=r"initial\.run.*other clamps \(1, this one 0\)"):
+        pc.discretise(probed(initial={"run": str(path)}, clamps=[])).initial_state()
 
 
 def test_regions_of_oblique_planes_and_turns_about_any_axis():

@@ -560,7 +560,7 @@ def test_a_plot_appears_under_its_name_only_when_it_is_whole(tmp_path, monkeypat
     monkeypatch.setattr(pc.figures, "render", lambda *a, **k: None)
     with pytest.raises(Terminated):
         report.write_report(comparison, tmp_path)
-    assert {p.name for p in tmp_path.iterdir()} == {"report.csv", "report.json", "report.md"}
+    assert {p.name for p in tmp_path.iterdir()} == {"report.csv", "report.json", "index.html"}
 
 
 # --- processes -------------------------------------------------------------------------

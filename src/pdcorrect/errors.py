@@ -66,7 +66,7 @@ class MissingExtraError(PdcorrectError, ImportError):
 
 EXTRAS = {
     "torch": "learn", "torch_geometric": "learn", "tensorboard": "learn",
-    "pyvista": "view", "matplotlib": "view", "imageio": "view", "dask": "cluster",
+    "pyvista": "view", "matplotlib": "view", "imageio": "view", "trame": "view", "dask": "cluster",
     "distributed": "cluster",
 }  # fmt: skip
 """Optional dependencies, by the extra that contains them."""

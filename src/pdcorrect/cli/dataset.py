@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Mapping
 from enum import StrEnum
 from pathlib import Path
@@ -120,15 +119,9 @@ def export(
 ) -> None:
     """Write a data set for MeshGraphNet tools (HDF5), or one simulation for ParaView."""
     from pdcorrect.data import export as exports
-    from pdcorrect.data.folder import missing_files
 
     if to is Layout.meshgraphnet:
         _unused(to, {"--mesh": mesh, "--simulation": simulation, "--run": run})
-        with contextlib.suppress(InputError):  # of config.toml, which no export needs
-            missing = missing_files(folder, split)
-            if missing:
-                told = f"{len(missing)} files that its config.toml asks for, as {missing[0]}"
-                typer.echo(f"warning: the data set lacks {told}.", err=True)
         written = exports.export_meshgraphnet(
             folder, target, base=base or "plain", split=split, overwrite=overwrite
         )
@@ -164,19 +157,9 @@ def import_(
     best: Annotated[bool, typer.Option("--best", help="Also run the best coarse model.")] = False,
 ) -> None:
     """Add a mesh and its simulations, computed elsewhere, to a data set."""
-    from pdcorrect.data.configuration import EVALUATION, TRAINING, VALIDATION
     from pdcorrect.data.import_files import import_trajectories
 
-    if "/" in split or split in ("", ".", ".."):
-        raise InputError(f"--split {split!r}: expected a name.")
     path = import_trajectories(
         sources, output, coarse=coarse or (), split=split, number=number, best=best
     )
     typer.echo(f"wrote {path}")
-    known = (TRAINING, VALIDATION, EVALUATION)
-    if split not in known:
-        typer.echo(
-            f"note: split {split!r} is one of your own; training reads {TRAINING!r} and "
-            f"{VALIDATION!r}, evaluation {EVALUATION!r} unless told otherwise.",
-            err=True,
-        )

@@ -22,6 +22,7 @@ from pdcorrect.cli.render import render
 from pdcorrect.cli.simulate import simulate
 from pdcorrect.cli.train import train, train_element, tune_element
 from pdcorrect.cli.validate import validate
+from pdcorrect.cli.view import view
 from pdcorrect.errors import (
     EXTRAS,
     ConvergenceError,
@@ -32,8 +33,8 @@ from pdcorrect.errors import (
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
 for command in (
-    new, simulate, info, compare, render, export, train, train_element, tune_element, evaluate,
-    validate, doctor,
+    new, simulate, info, compare, render, view, export, train, train_element, tune_element,
+    evaluate, validate, doctor,
 ):  # fmt: skip
     app.command()(command)
 app.add_typer(dataset, name="dataset")

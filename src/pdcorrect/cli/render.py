@@ -4,24 +4,35 @@ from __future__ import annotations
 
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Optional
+from typing import Annotated, Any, Optional
 
 import typer
 
 from pdcorrect.cli.common import say
 from pdcorrect.errors import InputError
 
-Colour = StrEnum("Colour", ["displacement", "error", "none"])
+Colour = StrEnum("Colour", ["displacement", "stress", "error", "none", "volume"])
 
 
 def render(
     runs: Annotated[list[Path], typer.Argument(help="Trajectory files.", show_default=False)],
     output: Annotated[Path, typer.Option("-o", "--output", help="Picture: .png, .gif or .mp4.")],
     label: Annotated[Optional[list[str]], typer.Option(help="Title of each run, in order.")] = None,
-    colour: Annotated[Colour, typer.Option(help="What to colour by.")] = Colour.displacement,
+    colour: Annotated[
+        Colour, typer.Option(help="What to colour by; stress is von Mises stress, volume det F.")
+    ] = Colour.displacement,
     frame: Annotated[Optional[int], typer.Option(help="Frame of a .png; -1 is the last.")] = None,
     fps: Annotated[float, typer.Option(help="Frames a second of a film.", min=0.1)] = 25.0,
     overlay: Annotated[bool, typer.Option("--overlay", help="Over each other (.png).")] = False,
+    camera: Annotated[
+        Optional[str],
+        typer.Option(help="x, y, z, iso, or AZIMUTH,ELEVATION in degrees.", show_default=False),
+    ] = None,
+    warp: Annotated[float, typer.Option(help="Displacements so many times as large.")] = 1.0,
+    section: Annotated[
+        Optional[str], typer.Option(help="Cut by a plane, x=0.02 (m), through the body at rest.")
+    ] = None,
+    size: Annotated[Optional[str], typer.Option(help="WIDTHxHEIGHT of the picture.")] = None,
 ) -> None:
     """Draw one run or several side by side; errors are against the last run given.
 
@@ -32,27 +43,70 @@ def render(
 
     if colour is Colour.error and len(runs) < 2:
         raise InputError("--colour error: expected two runs or more, the last is the reference.")
-    if frame is not None and output.suffix.lower() != ".png":
-        raise InputError(f"--frame with {output.suffix}: a film shows all frames; leave it out.")
-    loaded = [load_trajectory(path) for path in runs]
-    by_value: figures.Colour = "error" if colour is Colour.error else "displacement"
     still = output.suffix.lower() == ".png"
+    if frame is not None and not still:
+        raise InputError(f"--frame with {output.suffix}: a film shows all frames; leave it out.")
     number = -1 if frame is None else frame
+    view = _camera(camera)
+    field: Any = None if colour is Colour.none else colour.value
+    loaded = [load_trajectory(path) for path in runs]
     names = label or [path.stem for path in runs]
     if overlay:
-        if colour is Colour.error:
-            raise InputError(
-                "--colour error with --overlay: runs have a colour each; leave it out."
-            )
-        figures.render_overlay(loaded, output, labels=names, frame=number)
+        _refuse_with_overlay(colour=colour, warp=warp, section=section, size=size)
+        figures.render_overlay(loaded, output, labels=names, frame=number, camera=view)
     else:
         figures.render(
             loaded,
             output,
             labels=names,
-            colour=None if colour is Colour.none else by_value,
+            colour=field,
             reference=loaded[-1] if colour is Colour.error else None,
             frame=number if still else None,
             fps=fps,
+            camera=view,
+            warp=warp,
+            section=_section(section),
+            size=_size(size),
         )
     say(f"wrote {output}")
+
+
+def _refuse_with_overlay(**options: Any) -> None:
+    usual = {"colour": Colour.displacement, "warp": 1.0}
+    for name, value in options.items():
+        if value != usual.get(name):
+            raise InputError(
+                f"--{name} {value} with --overlay: runs have a colour each and are drawn as they "
+                "are; leave it out."
+            )
+
+
+def _camera(text: str | None) -> Any:
+    """A name, or azimuth and elevation."""
+    if text is None or "," not in text:
+        return text
+    try:
+        azimuth, elevation = map(float, text.split(","))
+    except ValueError:
+        raise InputError(f"--camera {text}: expected two angles, as 30,20.") from None
+    return azimuth, elevation
+
+
+def _section(text: str | None) -> tuple[str, float] | None:
+    if text is None:
+        return None
+    axis, _, place = text.partition("=")
+    try:
+        return axis.strip(), float(place)
+    except ValueError:
+        raise InputError(f"--section {text}: expected an axis and a place, as x=0.02.") from None
+
+
+def _size(text: str | None) -> tuple[int, int] | None:
+    if text is None:
+        return None
+    try:
+        width, height = map(int, text.lower().split("x"))
+    except ValueError:
+        raise InputError(f"--size {text}: expected WIDTHxHEIGHT, as 1200x800.") from None
+    return width, height

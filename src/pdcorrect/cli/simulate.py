@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Optional
+from typing import TYPE_CHECKING, Annotated, Optional
 
 import typer
 
 from pdcorrect._files import INTERRUPTED, TERMINATED, Terminated
 from pdcorrect.cli import common
-from pdcorrect.errors import InputError
+from pdcorrect.errors import InputError, require_extra
 
 if TYPE_CHECKING:
     from pdcorrect.scene import Scene
@@ -40,6 +40,9 @@ def simulate(
     allow_inverted: Annotated[
         bool, typer.Option("--allow-inverted", help="Exit status 0 also with inverted cells.")
     ] = False,
+    report: Annotated[
+        Optional[Path], typer.Option(help="Folder for a page with pictures (extra 'view').")
+    ] = None,
     overwrite: common.Overwrite = False,
     resume: Annotated[
         bool, typer.Option(help="Continue an existing output file after its last complete frame.")
@@ -50,9 +53,10 @@ def simulate(
     Exit status 1 if frames ended with inverted cells, which are written all the same.
     """
     from pdcorrect._files import make_folder
-    from pdcorrect.evaluation.report import inverted_frames
+    from pdcorrect.evaluation.run_report import summary, write_run_report
     from pdcorrect.io.trajectory import load_trajectory
     from pdcorrect.scene import Scene
+    from pdcorrect.solvers.rollout import inverted_frames
 
     if resume and overwrite:
         raise InputError("--resume with --overwrite: expected one of them; resume keeps the file.")
@@ -64,8 +68,11 @@ def simulate(
             "on: expected --refine 1, --solver pd and no --learned."
         )
     loaded = Scene.load(scene)
-    if vtu:
-        make_folder(vtu)
+    for folder in filter(None, (vtu, report)):
+        make_folder(folder)
+    if report:
+        require_extra("pyvista", "view")
+        require_extra("matplotlib", "view")
     common.tell_of_compiling()
     stepper = _make_stepper(loaded, solver, refine, learned, model, gate)
     if loaded.probes:
@@ -81,12 +88,12 @@ def simulate(
     before = 0 if earlier is None else len(earlier)
     if earlier is None or before < count:
         stats = _run(stepper, count, output, earlier, overwrite).arrays()
-        _summary(stats, stepper, before)
+        for sentence in summary(stats, stepper, before):
+            common.say(sentence)
         common.say(f"wrote {output}")
     else:
-        stats = earlier.stats
+        stats = dict(earlier.stats)
     inverted = inverted_frames(stats, loaded.time.step)
-    common.say(inverted)
     if loaded.probes:
         from pdcorrect.io.probes import write_probes
 
@@ -98,8 +105,12 @@ def simulate(
             load_trajectory(output), vtu, name=output.stem, stress_of=stepper.problem
         )
         common.say(f"wrote {series}")
-    if estimate_error:
-        common.say(_estimated(load_trajectory(output)))
+    estimated = _estimated(load_trajectory(output)) if estimate_error else ""
+    common.say(estimated)
+    if report:
+        more = (estimated,) if estimated else ()
+        page = write_run_report(load_trajectory(output), stepper, report, more)
+        common.say(f"report: {page}")
     if inverted and not allow_inverted:
         raise typer.Exit(common.FAILED)
 
@@ -168,47 +179,6 @@ def _run(
             ended = TERMINATED if isinstance(stop, Terminated) else INTERRUPTED
             raise typer.Exit(ended) from None
     return log
-
-
-def _summary(stats: dict[str, Any], stepper: Stepper, resumed: int) -> None:
-    """Frames, time, iterations, energy, and what is unusual about a run."""
-    from pdcorrect.evaluation.report import gained_energy, refused_corrections, three_digits
-
-    count, seconds = len(stats["seconds"]), stats["seconds"].sum()
-    problem, status = stepper.problem, stats["status"].tolist()
-    ends = ", ".join(f"{status.count(name)} {name.lower()}" for name in dict.fromkeys(status))
-    ran = f"{count} frames ({resumed} resumed)" if resumed else f"{count} frames"
-    element, correction = problem.element, problem.correction
-    if correction is not None and not correction.learned.all():
-        element += f", {int(correction.learned.sum())} of them learned"
-    common.say(
-        f"{ran} of {problem.scene.time.step:g} s on {len(problem.positions)} nodes "
-        f"and {len(problem.cells)} cells ({element}, {problem.mass_rule} mass) in "
-        f"{seconds:.2f} s: {three_digits(1e3 * seconds / count)} ms a frame"
-    )
-    common.say(
-        f"iterations a frame: mean {stats['iterations'].mean():.1f}, most "
-        f"{stats['iterations'].max()}; frames: {ends}"
-    )
-    others = {
-        "clamp_work": "work of the clamps", "obstacle_work": "work of the obstacles",
-        "actuator_work": "work of the actuators", "damping_loss": "lost to damping",
-        "friction_loss": "lost to friction",
-    }  # fmt: skip
-    work = {"external_work": "work of the loads"}
-    work |= {name: text for name, text in others.items() if name in stats and stats[name].any()}
-    common.say(
-        f"energy at the end: elastic {stats['elastic_energy'][-1]:.4g} J, kinetic "
-        f"{stats['kinetic_energy'][-1]:.4g} J; over the run "
-        + ", ".join(f"{text} {stats[name].sum():.4g} J" for name, text in work.items())
-    )
-    if problem.scene.time.integrator != "quasi-static":
-        common.say(gained_energy(stats))
-    if "gate" in stats:
-        if not stats["refused"].all():
-            largest = 1e3 * stats["correction"].max()
-            common.say(f"corrections: at most {largest:.3g} mm of a node in a frame")
-        common.say(refused_corrections(stats["gate"]))
 
 
 def _estimated(run: Trajectory) -> str:

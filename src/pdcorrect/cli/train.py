@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Optional
 import typer
 
 from pdcorrect.cli import common
-from pdcorrect.errors import OutputError
 
 if TYPE_CHECKING:
     from pdcorrect.training.progress import Progress
@@ -132,19 +131,16 @@ def tune_element(
     from pdcorrect.scene import Scene, learned_coarse
 
     loaded = Scene.load(scene)
-    if output.exists() and not overwrite:
-        raise OutputError(f"{output}: there already: expected a new name, or --overwrite.")
     common.tell_of_compiling()
     problem = discretise(learned_coarse(loaded))
-    found = tune(problem, output, iterations=iterations, seed=seed, report=typer.echo)
-    names = "displacements", "frequencies"
-    for name in names:
+    found = tune(
+        problem, output, iterations=iterations, seed=seed, report=typer.echo, overwrite=overwrite
+    )
+    for name in ("displacements", "frequencies"):
         without, before, after = (100.0 * errors[name] for errors in found)
         typer.echo(
             f"{name}: {without:.2f} % off without learning, {before:.2f} % before, "
             f"{after:.2f} % now"
         )
-    if all(found.after[name] >= found.before[name] for name in names):
-        typer.echo("neither has fallen: compare both weights with the converged motion", err=True)
     told = os.path.relpath(output, scene.parent)  # as the scene's paths are
     typer.echo(f'wrote {output}; [solver] element = "hex8-learned", weights = "{told}"')

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import shutil
+import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -15,9 +16,9 @@ from numpy.typing import NDArray
 
 from pdcorrect._files import make_folder, write_text
 from pdcorrect.data.configuration import EVALUATION, TRAINING, VALIDATION
-from pdcorrect.data.folder import shard_paths, splits_of
+from pdcorrect.data.folder import missing_files, shard_paths, splits_of
 from pdcorrect.data.schema import PLAIN, REFERENCE, SUFFIX, Shard, Simulation, read_shard
-from pdcorrect.errors import InputError, OutputError
+from pdcorrect.errors import InputError, OutputError, PdcorrectWarning
 from pdcorrect.fem.graph import node_means, tetrahedra, velocities
 from pdcorrect.io.vtk import write_vtu_series
 from pdcorrect.trajectory import Trajectory
@@ -125,6 +126,11 @@ def export_meshgraphnet(
         If ``target`` cannot be written, or holds a file of the same name.
     """
     splits = splits_of(folder) if split is None else [split]
+    with contextlib.suppress(InputError):  # of config.toml, which no export needs
+        missing = missing_files(folder, split)
+        if missing:
+            told = f"{len(missing)} files that its config.toml asks for, as {missing[0]}"
+            warnings.warn(f"the data set lacks {told}.", PdcorrectWarning, stacklevel=2)
     with _staging_folder(Path(target), overwrite) as staging:
         written = _write_splits(staging, folder, splits, base)
     return [Path(target) / path.name for path in written]
@@ -208,7 +214,7 @@ def export_vtu(
 def _write_split(path: Path, folder: str | Path, split: str, base: str) -> dict[str, Any]:
     """One file of the MeshGraphNet layout; returns its description."""
     first: dict[str, Any] = {}
-    with h5py.File(path, "w") as file:
+    with h5py.File(path, "w", locking=False) as file:
         for number, (where, shard, simulation) in enumerate(_simulations(folder, split)):
             fields = _fields(where, shard, simulation, base)
             meta = _meta(fields, float(shard.attributes["time_step"]))

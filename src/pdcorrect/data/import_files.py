@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -9,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from pdcorrect.data.configuration import EVALUATION, TRAINING, VALIDATION
 from pdcorrect.data.importing import (
     ImportedMotion,
     check_integrator,
@@ -18,13 +20,14 @@ from pdcorrect.data.importing import (
 )
 from pdcorrect.data.schema import CONFIG, INTEGRATOR, SUFFIX, Array, Shard, write_shard
 from pdcorrect.data.simulate import arrays_of
-from pdcorrect.errors import FileFormatError, InputError
+from pdcorrect.errors import FileFormatError, InputError, PdcorrectWarning
 from pdcorrect.fem.problem import Problem
 from pdcorrect.io.trajectory import load_trajectory
 from pdcorrect.scene import Scene
 from pdcorrect.solvers.rollout import restrict
 from pdcorrect.trajectory import Trajectory
 
+_KNOWN = (TRAINING, VALIDATION, EVALUATION)
 _NEEDED = ("points", "cells", "free", "young", "poisson", "density", "time_step")
 _MOTION = ("reference", "forces", "coarse", "predictions")
 _BODY = ("body", "material", "materials", "clamps", "damping")
@@ -61,6 +64,15 @@ def import_trajectories(
         If a file cannot be read or fails a check, the folder is that of a generated data set,
         or the file exists already or cannot be written.
     """
+    if "/" in split or split in ("", ".", ".."):
+        raise InputError(f"split {split!r}: expected a name.")
+    if split not in _KNOWN:
+        warnings.warn(
+            f"split {split!r} is one of your own; training reads {TRAINING!r} and {VALIDATION!r}, "
+            f"evaluation {EVALUATION!r} unless told otherwise.",
+            PdcorrectWarning,
+            stacklevel=2,
+        )
     if (Path(folder) / CONFIG).exists():
         raise InputError(
             f"{folder} holds {CONFIG}, as a generated data set: expected a folder of its own for "

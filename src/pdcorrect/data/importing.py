@@ -212,8 +212,10 @@ def portable(scene: Scene) -> Scene:
     Raises
     ------
     InputError
-        If a region is a group, which a data set's mesh does not have.
+        If it has several bodies, or a region is a group, which a data set's mesh does not have.
     """
+    if scene.bodies:
+        raise InputError(f"bodies: {len(scene.bodies)} of them: a data set keeps [body] alone.")
     if not isinstance(scene.body, MeshFile):
         return scene
     for name in ("clamps", "loads", "materials"):

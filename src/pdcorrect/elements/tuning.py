@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
@@ -17,7 +18,7 @@ from pdcorrect.elements.answers import answers
 from pdcorrect.elements.bodies import Grid, VoxelBody, box, connected, holds, nodes_of
 from pdcorrect.elements.linear import Batch, Errors, collate, errors, loss, means, sample
 from pdcorrect.elements.network import Descent, ElementNetwork
-from pdcorrect.errors import ConvergenceError, InputError
+from pdcorrect.errors import ConvergenceError, InputError, OutputError, PdcorrectWarning
 from pdcorrect.fem.element_network import MODEL, read_network, write_network
 from pdcorrect.fem.learned import LARGEST_POISSON, effective_moduli
 from pdcorrect.fem.neighbourhood import on_grid
@@ -51,6 +52,7 @@ def tune(
     iterations: int = 200,
     seed: int = 0,
     report: Report = print,
+    overwrite: bool = False,
 ) -> Tuned:
     """Write weights that are best for one body, and a card beside them.
 
@@ -63,6 +65,8 @@ def tune(
         Of the coarse mesh, whatever its element.
     path : Path
         Of the weights; the card has the same name and the ending json.
+    overwrite : bool
+        Replace an existing file.
 
     Raises
     ------
@@ -72,9 +76,15 @@ def tune(
         If cells are off the grid or the body is in several pieces, nodes are held in some
         components, or some nodes but no face of a cell, Poisson's ratios are several or too large,
         or the file's name does not end with safetensors.
+    OutputError
+        If the file exists, or cannot be written.
     """
     if path.suffix != ".safetensors":
         raise InputError(f"{path}: expected a name that ends with .safetensors.")
+    if path.exists() and not overwrite:
+        raise OutputError(
+            f"{path}: exists already: expected a new name, or --overwrite (overwrite=True)."
+        )
     body = own_body(problem)
     make_folder(path.parent)
     rng = np.random.default_rng(seed)
@@ -100,6 +110,13 @@ def tune(
     tuned = Tuned(means(base), means(started), means(_found(network, batches)))
     if not np.isfinite(tuned.after["displacements"]):
         raise ConvergenceError("the weights have become infinite or NaN.")
+    if all(tuned.after[name] >= tuned.before[name] for name in ("displacements", "frequencies")):
+        warnings.warn(
+            "neither displacements nor frequencies are nearer: compare both weights with the "
+            "converged motion",
+            PdcorrectWarning,
+            stacklevel=2,
+        )
     write_network(path, {k: v.numpy() for k, v in network.state_dict().items()})
     card = {
         "format": 1,

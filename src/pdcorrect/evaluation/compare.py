@@ -14,6 +14,7 @@ from pdcorrect.errors import ConvergenceError, InputError
 from pdcorrect.fem.problem import Problem, discretise
 from pdcorrect.metrics import relative_error
 from pdcorrect.scene import Scene, best_coarse, check_scene, learned_coarse, trained_coarse
+from pdcorrect.solvers.implicit import whole
 from pdcorrect.solvers.newton import Newton
 from pdcorrect.solvers.projective import ProjectiveDynamics
 from pdcorrect.solvers.rollout import restrict, rollout
@@ -310,7 +311,7 @@ def compare(
     labels = [case.label for case in cases]
     if len(set(labels)) < len(labels):
         raise InputError(f"labels {', '.join(labels)}: expected each one once.")
-    count = scene.time.frames if frames is None else frames
+    count = whole("frames", scene.time.frames if frames is None else frames, 1)
     for name, other in (("converged", converged), ("finer", finer)):
         if other is not None and len(other) != count:
             raise InputError(f"{name} has {len(other)} frames: expected {count}.")

@@ -17,8 +17,9 @@ from pdcorrect._files import make_folder, part_of_process, replacing
 from pdcorrect._version import __version__
 from pdcorrect.errors import ConvergenceError, FileFormatError, InputError
 from pdcorrect.fem.problem import Problem, discretise
+from pdcorrect.fem.scene_mesh import scene_mesh
 from pdcorrect.metrics import relative_error
-from pdcorrect.scene import MeshFile, Scene, best_coarse, check_scene, learned_coarse
+from pdcorrect.scene import Body, Scene, best_coarse, check_scene, learned_coarse
 from pdcorrect.solvers.projective import ProjectiveDynamics
 from pdcorrect.solvers.rollout import OWN_MATERIAL, OnStep, restrict, rollout
 from pdcorrect.state import StepResult
@@ -141,15 +142,15 @@ def _own_error(scene: Scene, run: Trajectory, on_step: OnRun | None) -> dict[str
 def _key(scene: Scene) -> str:
     """Hash of all that the run depends on."""
     content = b""
-    if isinstance(scene.body, MeshFile):
-        from pdcorrect.fem.mesh_files import read_hex_mesh  # meshio only where it is needed
-
-        mesh = read_hex_mesh(scene.body.path, scene.body.scale)
+    bodies = [_nameless(body) for body in scene.all_bodies.values()]
+    if bodies != [*scene.all_bodies.values()]:
+        mesh = scene_mesh(scene)
         content = mesh.positions.tobytes() + mesh.cells.tobytes()
         for name, group in sorted(mesh.groups.items()):
             content += repr((name, *(own.tolist() for own in group))).encode()
-        scene = scene.with_changes(body={"path": f"mesh{scene.body.path.suffix}"})
-    for named in (getattr(scene.body, "given", None), scene.initial and scene.initial.run):
+        scene = scene.model_copy(update={"body": bodies[0], "bodies": tuple(bodies[1:])})
+    grids = [getattr(body, "given", None) for body in bodies]
+    for named in (*grids, scene.initial and scene.initial.run):
         if isinstance(named, Path):
             with contextlib.suppress(OSError):  # discretise says what is wrong
                 content += named.read_bytes()
@@ -162,6 +163,12 @@ def _key(scene: Scene) -> str:
     for part in parts:
         digest.update(len(part).to_bytes(8, "little") + part)
     return digest.hexdigest()
+
+
+def _nameless(body: Body) -> Body:
+    """A body whose files have no folder and no name."""
+    found = {key: Path(f"mesh{value.suffix}") for key, value in body if isinstance(value, Path)}
+    return body.model_copy(update=found)
 
 
 def _kept(path: Path, frames: int) -> Trajectory | None:

@@ -1,4 +1,4 @@
-"""A `Comparison` as Markdown, CSV, JSON, figures and files for ParaView; notes on runs."""
+"""A `Comparison` as a page, CSV, JSON, figures and files for ParaView; notes on runs."""
 
 from __future__ import annotations
 
@@ -9,29 +9,29 @@ import json
 import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 import pdcorrect.figures as figures
 from pdcorrect._environment import environment
 from pdcorrect._files import make_folder, write_text
 from pdcorrect.evaluation.compare import Comparison, Row
 from pdcorrect.evaluation.converged import MESH_ERROR, TIME_ERROR
+from pdcorrect.evaluation.page import write_page
 from pdcorrect.io.vtk import delete_vtu_series, write_vtu_series
 from pdcorrect.metrics import largest_displacement, probes
-from pdcorrect.state import Status
+from pdcorrect.scene import Scene
+from pdcorrect.solvers.rollout import inverted_frames
 from pdcorrect.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 
+PAGE = "index.html"
 VTU = "vtu"
 """Folder, inside a report's, of what `write_series` writes."""
 _NOT_UNIQUE = 100.0
 """Tolerances by which PD and Newton differ where they have taken different branches."""
-_GAINED = 0.1
-"""Of a run's largest energy: more than steps of second order gain where they are short enough."""
 
 # --- the table ---------------------------------------------------------------------------
 
@@ -91,19 +91,6 @@ def shown_label(comparison: Comparison, row: Row) -> str:
 # --- files -------------------------------------------------------------------------------
 
 
-def to_markdown(comparison: Comparison, pictures: list[str]) -> str:
-    """The whole report as Markdown."""
-    rows = table(comparison)
-    lines = [f"# {comparison.scene.name}", ""]
-    lines += [f"![{name}]({name})" for name in pictures[:1]] + [""]
-    lines += ["| " + " | ".join(rows[0]) + " |", "|---|" + "---:|" * (len(rows[0]) - 1)]
-    lines += ["| " + " | ".join(row.values()) + " |" for row in rows]
-    lines += ["", *[f"- {note}" for note in notes(comparison)], ""]
-    lines += [f"![{name}]({name})\n" for name in pictures[1:]]
-    lines += ["Measured on: " + ", ".join(f"{k} {v}" for k, v in environment().items()) + ".", ""]
-    return "\n".join(lines)
-
-
 def to_csv(comparison: Comparison) -> str:
     """All numbers in SI units, one line a solver; of those that failed label and reason."""
     buffer = io.StringIO()
@@ -137,15 +124,20 @@ def to_json(comparison: Comparison) -> str:
 
 
 def write_report(comparison: Comparison, folder: str | Path, draw: bool = True) -> Path:
-    """Write report.md, report.csv, report.json and, if ``draw``, figures; path of the first."""
+    """Write index.html, report.csv, report.json and, if ``draw``, figures; path of the first.
+
+    The page holds its figures, so it needs no other file.
+    """
     folder = make_folder(folder)
     write_text(folder / "report.csv", to_csv(comparison))
     write_text(folder / "report.json", to_json(comparison))
-    write_text(folder / "report.md", to_markdown(comparison, []))
-    if draw:
-        pictures = draw_figures(comparison, folder)
-        write_text(folder / "report.md", to_markdown(comparison, pictures))
-    return folder / "report.md"
+
+    def page(pictures: Mapping[str, str]) -> Path:
+        rows, sentences = table(comparison), notes(comparison)
+        return write_page(folder / PAGE, comparison.scene.name, rows, sentences, pictures)
+
+    page({})  # what drawing may not come to
+    return page(draw_figures(comparison, folder)) if draw else folder / PAGE
 
 
 def write_series(comparison: Comparison, folder: str | Path) -> list[Path]:
@@ -172,24 +164,25 @@ def write_series(comparison: Comparison, folder: str | Path) -> list[Path]:
 # --- figures -----------------------------------------------------------------------------
 
 
-def draw_figures(comparison: Comparison, folder: Path) -> list[str]:
-    """Bodies side by side and over each other, and plots; returns their file names.
+def draw_figures(comparison: Comparison, folder: Path) -> dict[str, str]:
+    """Bodies in motion, side by side and over each other, and plots; captions by file name.
 
     No plot of errors where there is none but the reference's.
     """
     labels = [row.label for row in comparison.rows]
-    runs = [comparison.runs[label] for label in labels]
+    runs = {label: comparison.runs[label] for label in labels}
     truth = comparison.on_coarse[comparison.reference]
     distance = np.linalg.norm(truth.positions - truth.points, axis=2)
     frame = int(distance.max(axis=1).argmax())
     figures.render(
-        runs,
+        list(runs.values()),
         folder / "comparison.png",
         labels=[_panel_label(comparison, row) for row in comparison.rows],
         colour="displacement",
         frame=frame,
     )
-    names = ["comparison.png"]
+    found = _animate(comparison, folder)
+    found["comparison.png"] = "All runs where the reference has moved farthest."
     overlaid = overlaid_labels(comparison)
     if len(overlaid) > 1:
         last = comparison.on_coarse[overlaid[-1]]
@@ -199,46 +192,79 @@ def draw_figures(comparison: Comparison, folder: Path) -> list[str]:
             labels=overlaid,
             frame=int(np.linalg.norm(last.positions - truth.positions, axis=(1, 2)).argmax()),
         )
-        names.append("overlay.png")
-    names += _draw_places(comparison, distance, folder)
-    figures.plot_energy(runs, folder / "energy.png", labels=labels)
+        found["overlay.png"] = "Runs over each other where the last of them is farthest away."
+    problem = next(iter(runs.values())).problem
+    free = True if problem is None else problem.free[problem.mesh.coarse_nodes].all(axis=1)
+    found |= draw_places(runs, comparison.scene, farthest_point(truth, free), folder)
     relative = comparison.converged is not None
     marks = {row.label: (row.seconds_a_frame, _error(row)) for row in comparison.rows}
     marks = {label: mark for label, mark in marks.items() if mark[1] > 0}
     if marks:
-        names += ["error_against_time.png", "error_over_time.png"]
+        figures.plot_error_against_time(marks, folder / "error_against_time.png", relative)
+        found["error_against_time.png"] = "Error against run time."
         figures.plot_error_over_time(
             comparison.errors_over_time(),
             truth.times,
             folder / "error_over_time.png",
             "converged motion" if relative else "reference",
         )
-        figures.plot_error_against_time(marks, folder / "error_against_time.png", relative)
-    return [*names, "energy.png"]
+        found["error_over_time.png"] = "Error over time."
+    figures.plot_energy(list(runs.values()), folder / "energy.png", labels=labels)
+    return {**found, "energy.png": "Energies, and work so far."}
 
 
-def _draw_places(comparison: Comparison, distance: Array, folder: Path) -> list[str]:
-    """Displacements of the scene's probes, or else of the free node that moves farthest."""
-    runs = {row.label: comparison.runs[row.label] for row in comparison.rows}
-    if not comparison.scene.probes:
-        problem = next(iter(runs.values())).problem
-        if problem is not None:
-            distance = distance * problem.free[problem.mesh.coarse_nodes].all(axis=1)
-        point = comparison.on_coarse[comparison.reference].points[distance.max(axis=0).argmax()]
+def _animate(comparison: Comparison, folder: Path) -> dict[str, str]:
+    """The motion of all runs on the coarse mesh, coloured by error where there is one."""
+    truth, name = comparison.converged, "the converged motion"
+    if truth is None:
+        truth, name = comparison.on_coarse[comparison.reference], comparison.reference
+    labels = [row.label for row in comparison.rows]
+    judged = [x for x in labels if comparison.converged or x != comparison.reference]
+    frames = film_frames(len(truth.times))
+    figures.render(
+        [comparison.on_coarse[label] for label in judged or labels],
+        folder / "motion.gif",
+        labels=judged or labels,
+        colour="error" if judged else "displacement",
+        reference=truth,
+        frame=frames,
+        fps=len(frames) / 3,
+    )
+    by = f"distance from {name}" if judged else "displacement"
+    return {"motion.gif": f"The motion, coloured by {by}."}
+
+
+def film_frames(count: int) -> list[int]:
+    """Up to forty of so many frames, evenly spaced, the first and the last among them."""
+    return np.unique(np.linspace(0, count - 1, min(count, 40)).round().astype(int)).tolist()
+
+
+def farthest_point(run: Trajectory, free: ArrayLike = True) -> Array:
+    """Where the node is at rest that moves farthest, (3,), m, among ``free`` ones (N,)."""
+    distance = np.linalg.norm(run.positions - run.points, axis=2).max(axis=0)
+    return run.points[(distance * np.asarray(free)).argmax()]
+
+
+def draw_places(
+    runs: Mapping[str, Trajectory], scene: Scene, point: Array, folder: Path
+) -> dict[str, str]:
+    """Displacements of the scene's probes, or else of the node at a point (m); captions by file."""
+    if not scene.probes:
         figures.plot_node_trajectories(
             list(runs.values()), folder / "node.png", node_point=point, labels=list(runs)
         )
-        return ["node.png"]
+        return {"node.png": "Displacement of the node that moves farthest."}
     found = {label: probes(run) for label, run in runs.items()}
-    names = []
-    for number, probe in enumerate(comparison.scene.probes):
-        names.append(f"probe_{number}.png")
+    captions = {}
+    for number, probe in enumerate(scene.probes):
+        name = f"probe_{number}.png"
         figures.plot_displacements(
             {label: (run.times, found[label][probe.name]) for label, run in runs.items()},
-            folder / names[-1],
+            folder / name,
             title=probe.name,
         )
-    return names
+        captions[name] = f"Displacement of the probe {probe.name}."
+    return captions
 
 
 def _error(row: Row) -> float:
@@ -339,39 +365,3 @@ def refused_corrections(reasons: Iterable[float]) -> str:
         return ""
     counts = ", ".join(f"{one.steps} because {one.reason.meaning}" for one in found)
     return f"{sum(one.steps for one in found)} of {len(every)} corrections were refused ({counts})."
-
-
-def gained_energy(stats: Mapping[str, Any]) -> str:
-    """Whether a run has more energy than was put in since its first step; empty if not."""
-    stored = np.asarray(stats["elastic_energy"]) + np.asarray(stats["kinetic_energy"])
-    put_in = np.asarray(stats["external_work"]) + stats["clamp_work"] - stats["damping_loss"]
-    if "contact_energy" in stats:
-        stored = stored + stats["contact_energy"]
-        put_in = put_in + stats["obstacle_work"] - stats["friction_loss"]
-    if "actuator_work" in stats:
-        put_in = put_in + stats["actuator_work"]
-    put_in = np.cumsum(put_in)
-    gained = float(((stored - stored[0]) - (put_in - put_in[0])).max())
-    if not gained > _GAINED * stored.max():
-        return ""
-    return (
-        f"the run gained {gained:.3g} J that nothing put in: take smaller steps or a smaller "
-        "spectral_radius"
-    )
-
-
-def inverted_frames(stats: Mapping[str, Any], step: float) -> str:
-    """How many frames of a run ended with inverted cells, and the first one; empty if none.
-
-    ``step`` is the length of a frame, s.
-    """
-    inverted = np.asarray(stats["status"]) == Status.INVERTED.name
-    if "smallest_volume_ratio" in stats:  # also after a fallback, which the status names instead
-        inverted = inverted | (np.asarray(stats["smallest_volume_ratio"]) <= 0.0)
-    if not inverted.any():
-        return ""
-    first = 1 + int(inverted.argmax())
-    return (
-        f"{inverted.sum()} of {len(inverted)} frames ended with inverted or folded cells, the "
-        f"first at t = {first * step:g} s"
-    )

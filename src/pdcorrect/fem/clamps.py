@@ -7,14 +7,13 @@ from functools import cached_property
 
 import numpy as np
 import scipy.linalg as la
-import scipy.sparse as sp
 from numpy.typing import NDArray
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation
 
 from pdcorrect.errors import SceneError
 from pdcorrect.fem.hexahedron import VTK_CORNERS, VTK_FACES, VTK_NODES
 from pdcorrect.fem.mesh import Group, HexMesh, boundary_faces
+from pdcorrect.fem.mesh_checks import connected_parts
 from pdcorrect.fem.multigrid import rigid_motions
 from pdcorrect.fem.operators import Space
 from pdcorrect.scene import Clamp, Motion, Region
@@ -115,8 +114,8 @@ class Selector:
         if region.group not in groups:
             names = ", ".join(map(repr, groups)) or "none"
             raise SceneError(
-                f"{key}.group = {region.group!r}: expected a group of the mesh file, which has "
-                f"{names}."
+                f"{key}.group = {region.group!r}: expected a named body, or a group of its mesh, "
+                f"which has {names}."
             )
         return groups[region.group]
 
@@ -261,10 +260,8 @@ def check_held(positions: Array, cells: NDArray[np.int64], clamps: Clamps) -> No
 
     Of nodes at positions (N, 3), m: without inertia such a motion has no solution.
     """
-    width = cells.shape[1]
-    edges = np.repeat(cells[:, :1], width - 1, axis=1).ravel(), cells[:, 1:].ravel()
-    graph = sp.coo_array((np.ones(len(edges[0])), edges), shape=(len(positions),) * 2)
-    count, part = connected_components(graph, directed=False)
+    part = connected_parts(cells, len(positions))
+    count = int(part.max()) + 1
     for number in range(count):
         nodes = np.flatnonzero(part == number)
         motions = rigid_motions(positions[nodes])

@@ -36,8 +36,8 @@ from pdcorrect.fem.neighbourhood import (
     cell_graph,
     cell_graph_slopes,
     extremes,
-    mirrored,
-    on_grid,
+    mirrored_parts,
+    on_grids,
 )
 
 Array = NDArray[np.float64]
@@ -114,9 +114,9 @@ class ElementWriter:
     def __init__(self, network: Network, body: ElasticBody, clamps: Clamps) -> None:
         self._network, self._body = network, body
         self.digest = network.digest
-        self._grid = on_grid(body.positions, body.cells)
+        self._grid, parts = on_grids(body.positions, body.cells)
         cells = self._grid.cells
-        self._images = mirrored(self._grid, clamps.free, clamps.still)
+        self._images = mirrored_parts(self._grid, parts, clamps.free, clamps.still)
         self._inside: NDArray[np.bool_] = ~self._images.held[: len(cells)].max(axis=1)
         least, most = self._extremes(body.materials.density)
         self._placed: dict[str, NDArray[np.bool_]] = {

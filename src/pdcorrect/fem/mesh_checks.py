@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
+import scipy.sparse as sp
 from numpy.typing import NDArray
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from pdcorrect.errors import MeshError
@@ -252,3 +254,10 @@ def _distances(corners: NDArray[np.float64], points: NDArray[np.float64]) -> NDA
         uv = np.clip(uv + step / determinant[:, None], 0, 1)
     u, v = uv[:, :1], uv[:, 1:]
     return np.linalg.norm(points - (a + u * along + v * across + u * v * twist), axis=1)
+
+
+def connected_parts(cells: NDArray[np.int64], nodes: int) -> NDArray[np.int64]:
+    """The number of the part of the mesh to which each node (N,) belongs; cells are (C, K)."""
+    edges = np.repeat(cells[:, :1], cells.shape[1] - 1, axis=1).ravel(), cells[:, 1:].ravel()
+    graph = sp.coo_array((np.ones(len(edges[0])), edges), shape=(nodes, nodes))
+    return np.asarray(connected_components(graph, directed=False)[1], dtype=np.int64)

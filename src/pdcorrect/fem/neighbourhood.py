@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from pdcorrect.fem.cube_symmetry import on_window
 from pdcorrect.fem.hexahedron import VTK_CORNERS
+from pdcorrect.fem.mesh_checks import connected_parts
 
 Array = NDArray[np.float64]
 
@@ -75,6 +76,16 @@ def on_grid(positions: Array, cells: NDArray[np.int64]) -> Grid:
     _, inverse, counts = np.unique(index, axis=0, return_inverse=True, return_counts=True)
     regular &= counts[inverse.ravel()] == 1
     return Grid(np.take_along_axis(cells, order, axis=1), order, index, regular)
+
+
+def on_grids(positions: Array, cells: NDArray[np.int64]) -> tuple[Grid, list[NDArray[np.int64]]]:
+    """The same of a mesh whose connected parts have a grid each; and the cells of each part."""
+    part = connected_parts(cells, len(positions))[cells[:, 0]]
+    parts = [np.flatnonzero(part == number) for number in np.unique(part)]
+    grids = [on_grid(positions, cells[own]) for own in parts]
+    back = np.argsort(np.concatenate(parts))
+    cells, order, place, regular = (np.concatenate(x)[back] for x in zip(*grids, strict=True))
+    return Grid(cells, order, place, regular), parts
 
 
 def neighbours_of(cells: NDArray[np.int64], place: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -138,6 +149,28 @@ def mirrored(grid: Grid, free: NDArray[np.bool_], still: NDArray[np.bool_]) -> I
     held = at_corners[cells % count]
     partly: NDArray[np.bool_] = unexplained[grid.cells].max(axis=1)
     return Images(neighbours_of(cells, place), original, held, partly)
+
+
+def mirrored_parts(
+    grid: Grid, parts: list[NDArray[np.int64]], free: NDArray[np.bool_], still: NDArray[np.bool_]
+) -> Images:
+    """The same of a body in several parts, each with planes of symmetry of its own."""
+    cells, order, place, regular = grid
+    found = [
+        mirrored(Grid(cells[own], order[own], place[own], regular[own]), free, still)
+        for own in parts
+    ]
+    count, own_count = sum(len(one.original) for one in found), len(grid.cells)
+    neighbours, original = np.empty((count, NEIGHBOURS), np.int64), np.empty(count, np.int64)
+    held, partly = np.empty((count, 8), dtype=bool), np.empty(own_count, dtype=bool)
+    first = own_count
+    for own, one in zip(parts, found, strict=True):
+        last = first + len(one.original) - len(own)
+        number = np.concatenate([own, np.arange(first, last)])
+        neighbours[number] = np.append(number, count)[one.neighbours]
+        original[number], held[number], partly[own] = own[one.original], one.held, one.partly
+        first = last
+    return Images(neighbours, original, held, partly)
 
 
 def cell_graph(

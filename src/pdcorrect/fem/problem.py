@@ -13,8 +13,7 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
-from pdcorrect._environment import total_memory
-from pdcorrect.errors import InputError, MeshError, PdcorrectWarning, SceneError
+from pdcorrect.errors import InputError, PdcorrectWarning, SceneError
 from pdcorrect.fem.assembly import summed_cells
 from pdcorrect.fem.banded import BandOrder
 from pdcorrect.fem.cell_correction import CellCorrection
@@ -25,18 +24,16 @@ from pdcorrect.fem.fibres import Fibres
 from pdcorrect.fem.initial import motion_from
 from pdcorrect.fem.loads import NodalLoad, assemble_loads
 from pdcorrect.fem.materials import Materials
-from pdcorrect.fem.mesh import HexMesh, voxel_mesh, warn_of_thin_cells
+from pdcorrect.fem.mesh import HexMesh, warn_of_thin_cells
 from pdcorrect.fem.mesh import refine as refine_mesh
 from pdcorrect.fem.operators import Space, freeze, lumped, mass_matrix
 from pdcorrect.fem.plausibility import warn_of_units
 from pdcorrect.fem.rollers import Rollers
-from pdcorrect.scene import Load, MeshFile, Scene, check_scene, trained_coarse
+from pdcorrect.fem.scene_mesh import check_size, scene_mesh
+from pdcorrect.scene import Load, Region, Scene, check_scene, trained_coarse
 from pdcorrect.state import State
 
 Array = NDArray[np.float64]
-_LEAST_BYTES = 4000
-"""Of memory that a cell takes, less than half of what was measured; eight times it as "hex27"."""
-
 _JUMP = 1e-3
 """Of the coarse cell size: how far clamps may be from where a run starts."""
 
@@ -159,10 +156,16 @@ class Problem(ElasticBody):
         mass = self.mass
         if self.mass_rule == "per-node":  # whose centre depends on the mesh
             mass = lumped(mass_matrix("lumped", self.space, self.materials.density))
-        wanted = initial.velocities(self.positions, mass @ self.positions / mass.sum())
+        region = initial.region or Region(everywhere=True)
+        moved = Selector(self.mesh, self.space, self.cell_size).nodes(region, "initial.region")
+        centre = mass[moved] @ self.positions[moved] / mass[moved].sum()
+        wanted = np.zeros_like(self.positions)
+        wanted[moved] = initial.velocities(self.positions[moved], centre)
         if initial.run is not None:
             frame = -1 if initial.frame is None else initial.frame
-            start, speed = motion_from(initial.run, frame, self.positions, self.cell_size)
+            start, speed = motion_from(
+                initial.run, frame, self.positions, self.cell_size, self.scene.clamps
+            )
             jump = np.abs(start - self.clamped_positions(0.0))[~self.free].max(initial=0.0)
             if jump > _JUMP * self.cell_size:
                 warnings.warn(
@@ -295,7 +298,7 @@ def discretise(
     mass, element : str, optional
         Override the scene's solver section.
     mesh : HexMesh, optional
-        Coarse mesh in place of the one that the scene's body makes or names.
+        Coarse mesh in place of the one that the scene's bodies make or name.
 
     Raises
     ------
@@ -314,7 +317,9 @@ def discretise(
             "resists the element's modes, for the volume term sees the mean deformation only. "
             "Use hex8-bubble, or an energy with a corotated part."
         )
-    coarse = _coarse_mesh(scene, refine, mesh)
+    if mesh is not None:
+        check_size(scene, len(mesh.cells), refine)
+    coarse = scene_mesh(scene, refine) if mesh is None else mesh
     refined = refine_mesh(coarse, refine)
     space = Space(refined, scene.solver.element)
     cell_size = float(np.cbrt(space.volumes().sum() / len(coarse.cells)))
@@ -374,41 +379,6 @@ def _learned(scene: Scene, body: ElasticBody, clamps: Clamps) -> CellCorrection:
             stacklevel=4,
         )
     return found
-
-
-def _coarse_mesh(scene: Scene, refine: int, given: HexMesh | None) -> HexMesh:
-    body = scene.body
-    if given is not None:
-        _check_size(scene, len(given.cells), refine)
-        return given
-    if isinstance(body, MeshFile):
-        from pdcorrect.fem.mesh_files import read_hex_mesh  # meshio only where it is needed
-
-        mesh = read_hex_mesh(body.path, body.scale)
-        _check_size(scene, len(mesh.cells), refine)
-        return mesh
-    solid, origin_index = body.occupancy()
-    _check_size(scene, int(np.count_nonzero(solid)), refine)
-    try:
-        return voxel_mesh(solid, origin_index, body.cell_size, body.origin)
-    except MeshError:  # a grid's cells can only lose their volume to rounding
-        raise SceneError(
-            f"body.cell_size = {body.cell_size:g} with body.origin = {list(body.origin)}: cells "
-            "have no volume in double precision: expected a size of about that of the body's "
-            "coordinates, in metres."
-        ) from None
-
-
-def _check_size(scene: Scene, cells: int, refine: int) -> None:
-    """Refuse meshes that cannot fit into the memory of the machine, before it is filled."""
-    memory = total_memory()
-    most = memory / (_LEAST_BYTES * (8 if scene.solver.element == "hex27" else 1))
-    if cells * refine**3 > most:
-        raise SceneError(
-            f"body: {cells} cells, {cells * refine**3} with refine = {refine}: expected at most "
-            f"{most:.0f} in the {memory / 1e9:.3g} GB of memory that this program may use. Use "
-            "larger cells or a smaller refine."
-        )
 
 
 Base = Literal["plain", "best", "total-mass"]

@@ -118,8 +118,8 @@ class Rollers:
             rows[np.searchsorted(places, clamp.nodes), k] = clamp.normal
         rows[:, -3:] = np.eye(3) * ~self.free[places][:, None]
         _, sizes, ways = np.linalg.svd(rows)
-        ways = ways * (sizes <= _ALIKE * sizes[:, :1])[:, :, None]
-        return places, ways, np.linalg.pinv(rows, rcond=_ALIKE)
+        ways = np.asarray(ways * (sizes <= _ALIKE * sizes[:, :1])[:, :, None], dtype=np.float64)
+        return places, ways, np.asarray(np.linalg.pinv(rows, rcond=_ALIKE), dtype=np.float64)
 
     def apply(self, x: Array) -> Array:
         """The second derivative times x (N + B, 3)."""

@@ -10,13 +10,11 @@ from collections.abc import Iterator, Sequence
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pdcorrect.errors import InputError
-from pdcorrect.fem.mesh import coincident_nodes
 from pdcorrect.figures.curves import (
     plot_displacements,
     plot_energy,
@@ -24,18 +22,22 @@ from pdcorrect.figures.curves import (
     plot_error_over_time,
     plot_node_trajectories,
 )
+from pdcorrect.figures.fields import COLOURS, Colour, body_of, on_nodes_of, scaled
+from pdcorrect.figures.obstacles import obstacles_of
 from pdcorrect.figures.panels import (
     Body,
     Camera,
+    Direction,
     Image,
     Painter,
+    camera_axes,
     check_offscreen,
     picture_file,
     shown_points,
     write_film,
     write_png,
 )
-from pdcorrect.figures.sheet import ColourBar, Sheet, length_unit, round_limit
+from pdcorrect.figures.sheet import Sheet, height_of_text
 from pdcorrect.trajectory import Trajectory
 
 __all__ = [
@@ -49,22 +51,8 @@ __all__ = [
     "render_overlay",
 ]
 
-Colour = Literal["displacement", "error"]
-
-_COLOURINGS = {
-    "displacement": ("displacement", "viridis"),
-    "error": ("distance to the reference", "YlOrRd"),
-}
-"""Title of the colour bar, and colour map."""
-_OVERLAID = (
-    ("#8fc3ee", "#0058a0"),
-    ("#7fdcb5", "#00774f"),
-    ("#f6b38d", "#b84a00"),
-    ("#e3a6cb", "#96457a"),
-    ("#efd06c", "#946f00"),
-    ("#cccccc", "#555555"),
-)
-"""Of faces and edges: blue, green, red, and three more."""
+_OVERLAID = ("#aab2bd", "#0058a0", "#d55e00", "#009e73", "#96457a", "#b08900")
+"""Grey of the body that is filled, then blue, orange, green, purple and ochre."""
 _STILL, _FILM = 1600, 1000  # default widths of pictures and films, pixels
 _ROW = 5  # panels side by side in a picture, at most
 
@@ -79,10 +67,15 @@ def render(
     frame: int | Sequence[int] | None = None,
     fps: float = 25.0,
     window: int | None = None,
+    size: tuple[int, int] | None = None,
+    camera: str | Direction | None = None,
+    warp: float = 1.0,
+    section: tuple[str, float] | None = None,
 ) -> Path:
     """Draw one run or several side by side, without a screen.
 
-    Runs are compared at the times that all of them have.
+    Runs are compared at the times that all of them have.  Obstacles of a run's scene are drawn
+    where they are at that time.
 
     Parameters
     ----------
@@ -91,10 +84,10 @@ def render(
         ``.png`` for a picture; ``.gif`` or ``.mp4`` for a film.
     labels : sequence of str, optional
         One for each run; may have several lines.
-    colour : {"displacement", "error"}, optional
-        Distance from rest, or from ``reference`` at the nodes that both have;
-        None draws plain bodies.  A run finer than the reference is drawn with
-        the reference's cells.
+    colour : {"displacement", "error", "stress", "volume"}, optional
+        Distance from rest, or from ``reference`` at the nodes that both have; von Mises stress or
+        det F, averaged to the nodes, of runs that hold their scene; None draws plain bodies.  A run
+        finer than the reference is drawn with the reference's cells.
     reference : Trajectory, optional
         For ``colour = "error"``; its mesh may be finer or coarser.
     frame : int or sequence of int, optional
@@ -106,6 +99,16 @@ def render(
         Frames a second of a film.
     window : int, optional
         Width of the picture in pixels; the height and the size of the text follow.
+    size : (int, int), optional
+        Width and height of the picture in pixels, in place of ``window``.
+    camera : {"x", "y", "z", "iso"} or (float, float), optional
+        Where it is looked from: along an axis, or azimuth (from x towards y) and elevation,
+        degrees.
+    warp : float
+        Displacements are drawn that many times as large; obstacles stay.
+    section : (str, float), optional
+        Axis and place, m: a plane through the body at rest; cells whose centre is on the camera's
+        side of it are left out.
 
     Returns
     -------
@@ -115,7 +118,8 @@ def render(
     Raises
     ------
     InputError
-        If labels, frames, suffix, times or reference do not fit.
+        If labels, frames, suffix, times, reference, camera, section or size do not fit, or a run
+        does not hold what stress is computed from.
     OutputError
         If the file cannot be written.
     MissingExtraError
@@ -128,26 +132,31 @@ def render(
     shared = _common_frames([*runs, reference] if colour == "error" and reference else runs)
     chosen = shared[:, _choose(frame, shared.shape[1], film)]
     bodies = [
-        _body(run, frames, colour, reference, chosen[-1])
+        replace(body_of(run, frames, colour, reference, chosen[-1]), obstacles=obstacles_of(run))
         for run, frames in zip(runs, chosen, strict=False)
     ]
     bar = None
     if colour:
-        bodies, bar = _scaled(bodies, colour)
+        bodies, bar = scaled(bodies, colour)
+    axes = camera_axes(camera)
+    bodies = [_shown(body, warp, section, axes) for body in bodies]
     count, side = chosen.shape[1], len(runs)
     panels = [(body, time) for time in range(count) for body in range(side)]
     a_page = side if film else len(panels)
-    in_rows = not film and (side == 1 or count == 1)
+    in_rows = film or side == 1 or count == 1
     columns = -(-a_page // -(-a_page // _ROW)) if in_rows else side  # about as many in each row
-    width = window or (900 if columns == 1 else _FILM if film else _STILL)
+    rows, captions = -(-a_page // columns), names + [""] * (a_page - side)
+    width, height = size or (window or _usual_width(columns, film), None)
+    font = _font(width, columns)
+    if height is not None:
+        height = _panel_height(height - height_of_text(captions, columns, font), rows, size)
     rest = _moves(bodies)
-    view = Camera.fitted(shown_points(bodies, rest), max(16, width // columns))
+    view = Camera.fitted(shown_points(bodies, rest), max(16, width // columns), axes, height)
     times = [[float(b.run.times[k]) for k in b.frames] for b in bodies]
-    captions = names + [""] * (a_page - side)
     longest = max(map(max, times))
-    sheet = Sheet(view, captions, columns, bar, _font(width, columns), longest=longest)
-    palette, limit = (bar.palette, bar.limit) if bar else ("viridis", 1.0)
-    with closing(Painter(bodies, view, palette, limit, rest)) as painter:
+    sheet = Sheet(view, captions, columns, bar, font, longest=longest, size=size)
+    palette, limits = (bar.palette, (bar.low, bar.limit)) if bar else ("viridis", (0.0, 1.0))
+    with closing(Painter(bodies, view, palette, limits, rest)) as painter:
 
         def pages() -> Iterator[Image]:
             for start in range(0, len(panels), a_page):
@@ -170,11 +179,13 @@ def render_overlay(
     labels: Sequence[str],
     frame: int = -1,
     window: int = 1200,
+    camera: str | Direction | None = None,
 ) -> Path:
     """Draw runs over each other in one picture, each in a colour of its own; returns ``output``.
 
-    Two to six runs, on meshes that hold the nodes of the coarsest, are drawn with its cells, so
-    that the same cells compare.  For the other arguments see `render`; one frame, ``.png`` only.
+    The first is filled, of the others the edges are drawn.  Two to six runs, on meshes that hold
+    the nodes of the coarsest, are drawn with its cells, so that the same cells compare.
+    For the other arguments see `render`; one frame, ``.png`` only.
 
     Raises
     ------
@@ -190,17 +201,40 @@ def render_overlay(
     (place,) = _choose(frame, shared.shape[1], film=False)
     coarsest = min(runs, key=lambda run: len(run.points))
     bodies = [
-        Body(_on_nodes_of(run, coarsest), frames[[place]], None)
+        Body(on_nodes_of(run, coarsest), frames[[place]], None, obstacles_of(run))
         for run, frames in zip(runs, shared, strict=True)
     ]
-    view, colours = Camera.fitted(shown_points(bodies, rest=False), window), _OVERLAID[: len(runs)]
+    points, colours = shown_points(bodies, rest=False), _OVERLAID[: len(runs)]
+    view = Camera.fitted(points, window, camera_axes(camera))
     time = float(runs[0].times[shared[0, place]])
-    key = [(label, edges) for label, (_, edges) in zip(labels, colours, strict=True)]
+    key = list(zip(labels, colours, strict=True))
     sheet = Sheet(view, [""], 1, None, _font(window, 2), longest=time, key=key)
-    drawn = Painter(bodies, view, "viridis", 1.0, rest=False, colours=colours)
+    drawn = Painter(bodies, view, "viridis", (0.0, 1.0), rest=False, colours=colours)
     with closing(drawn) as painter, picture_file(output) as part:
         write_png(part, sheet.page([painter.overlay(0)], [time]))
     return output
+
+
+def _usual_width(columns: int, film: bool) -> int:
+    return 900 if columns == 1 else _FILM if film else _STILL
+
+
+def _panel_height(room: int, rows: int, size: tuple[int, int] | None) -> int:
+    if room < 16 * rows:
+        raise InputError(f"size {size}: expected more room for the bodies beside the text.")
+    return room // rows
+
+
+def _shown(
+    body: Body, warp: float, section: tuple[str, float] | None, axes: NDArray[np.float64]
+) -> Body:
+    """A body as it is drawn: cut and with displacements of another size."""
+    if section is not None:
+        name, place = section
+        if name not in ("x", "y", "z"):
+            raise InputError(f"section {name!r}: expected x, y or z.")
+        body = body.cut("xyz".index(name), place, axes)
+    return body if warp == 1.0 else body.warped(warp)
 
 
 def _font(width: int, columns: int) -> float:
@@ -222,8 +256,8 @@ def _check_arguments(
         raise InputError("render: expected at least one trajectory.")
     if labels is not None and len(labels) != len(runs):
         raise InputError(f"{len(labels)} labels for {len(runs)} runs: expected as many.")
-    if colour not in (None, *_COLOURINGS):
-        raise InputError(f"colour = {colour!r}: expected 'displacement', 'error' or None.")
+    if colour not in (None, *COLOURS):
+        raise InputError(f"colour = {colour!r}: expected one of {', '.join(COLOURS)}, or None.")
     if colour == "error" and reference is None:
         raise InputError("colour = 'error': expected a reference trajectory.")
     suffix = output.suffix.lower()
@@ -261,47 +295,6 @@ def _choose(frame: int | Sequence[int] | None, count: int, film: bool) -> list[i
         if not -count <= number < count:
             raise InputError(f"frame {number}: expected {-count} to {count - 1}.")
     return [int(number) % count for number in wanted]
-
-
-def _body(
-    run: Trajectory,
-    frames: NDArray[np.int64],
-    colour: Colour | None,
-    reference: Trajectory | None,
-    reference_frames: NDArray[np.int64],
-) -> Body:
-    if colour is None:
-        return Body(run, frames, None)
-    if colour == "displacement" or reference is None:
-        return Body(run, frames, np.linalg.norm(run.positions[frames] - run.points, axis=2))
-    run = _on_nodes_of(run, reference)
-    nodes = coincident_nodes(reference.points, run.points, _tolerance(run))
-    difference = run.positions[frames] - reference.positions[reference_frames][:, nodes]
-    return Body(run, frames, np.linalg.norm(difference, axis=2))
-
-
-def _on_nodes_of(run: Trajectory, other: Trajectory) -> Trajectory:
-    """A run at the nodes of another one, with its cells, where it has more nodes."""
-    if len(run.points) <= len(other.points):
-        return run
-    nodes = coincident_nodes(run.points, other.points, _tolerance(other))
-    return replace(
-        run, positions=run.positions[:, nodes], velocities=run.velocities[:, nodes],
-        points=other.points, cells=other.cells,
-    )  # fmt: skip
-
-
-def _tolerance(run: Trajectory) -> float:
-    return 1e-6 * float(np.ptp(run.points[run.cells[0]], axis=0).max())
-
-
-def _scaled(bodies: list[Body], colour: Colour) -> tuple[list[Body], ColourBar]:
-    """Values in the unit in which the largest reads best."""
-    largest = max(float(b.values.max()) for b in bodies if b.values is not None)
-    factor, unit = length_unit(largest or 1e-3)
-    title, palette = _COLOURINGS[colour]
-    bar = ColourBar(f"{title} [{unit}]", palette, round_limit(factor * largest or 1.0))
-    return [replace(b, values=factor * b.values) for b in bodies if b.values is not None], bar
 
 
 def _moves(bodies: list[Body]) -> bool:

@@ -15,17 +15,22 @@ from pdcorrect.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 _COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000")
-_MARKS = "osD^"  # of the first round of colours, the second and so on
+_MARKS = "osD^vPX*"
+_STYLES = ("-", "--", "-.", ":")  # of the first round of colours, the second and so on
 _FONT = 9  # of legends, points
-
-_STYLES = ("-", "--", "-.", ":")
 
 _ENERGIES = {
     "elastic_energy": "elastic [J]",
     "kinetic_energy": "kinetic [J]",
     "external_work": "work of the loads [J]",
 }
-_OTHER_WORK = {"clamp_work": "work of the clamps [J]", "damping_loss": "lost to damping [J]"}
+_OTHER_WORK = {
+    "clamp_work": "work of the clamps [J]",
+    "obstacle_work": "work of the obstacles [J]",
+    "actuator_work": "work of the actuators [J]",
+    "damping_loss": "lost to damping [J]",
+    "friction_loss": "lost to friction [J]",
+}
 """Drawn where a run has any."""
 
 
@@ -89,11 +94,17 @@ def _legend(figure: Any, axes: Sequence[Any]) -> None:
 
 
 def _style(index: int) -> dict[str, Any]:
-    return {
-        "color": _COLOURS[index % len(_COLOURS)],
-        "linestyle": _STYLES[index % len(_STYLES)],
-        "linewidth": 1.8,
-    }
+    turn, colour = divmod(index, len(_COLOURS))
+    style = _STYLES[turn % len(_STYLES)]
+    return {"color": _COLOURS[colour], "linestyle": style, "linewidth": 1.8}
+
+
+def _curve(axis: Any, x: Array, y: Array, label: str, index: int) -> None:
+    """A line with a few marks, at other places than those of its neighbours."""
+    axis.plot(
+        x, y, label=label, marker=_MARKS[index % len(_MARKS)], markersize=5,
+        markevery=(0.02 * (index % 7), 0.14), **_style(index),
+    )  # fmt: skip
 
 
 def plot_node_trajectories(
@@ -123,7 +134,7 @@ def plot_displacements(
     figure, axes = _axes(3, 7.0)
     for index, (label, (times, moved)) in enumerate(histories.items()):
         for axis, values, name in zip(axes, 1e3 * moved.T, "xyz", strict=True):
-            axis.plot(times, values, label=label, **_style(index))
+            _curve(axis, times, values, label, index)
             axis.set_ylabel(f"{name} displacement [mm]")
     axes[0].set_title(title, fontsize=11)
     _legend(figure, axes)
@@ -136,7 +147,7 @@ def plot_energy(
 ) -> Path:
     """Elastic and kinetic energy and the work of the loads so far, over time, J.
 
-    Likewise the work of moving clamps and the loss to damping, where there is any.
+    Likewise the work of clamps, obstacles and actuators and the losses, where there are any.
     """
     runs = _labelled(trajectories, labels)
     names = {name: t for name, t in _ENERGIES.items() if any(name in r.stats for r, _ in runs)}
@@ -152,7 +163,7 @@ def plot_energy(
             if name in run.stats:
                 values = np.asarray(run.stats[name], dtype=np.float64)
                 values = values if name.endswith("energy") else np.cumsum(values)
-                axis.plot(run.times[1:], values, label=label, **_style(index))
+                _curve(axis, run.times[1:], values, label, index)
     _legend(figure, axes)
     axes[-1].set_xlabel("time [s]")
     return _save(figure, output)
@@ -167,7 +178,7 @@ def plot_error_over_time(
             raise InputError(f"{label}: {values.shape} errors at {times.shape} times.")
     figure, (axis,) = _axes(1, 4.0)
     for index, (label, values) in enumerate(errors.items()):
-        axis.plot(times[1:], 1e3 * values[1:], label=label, **_style(index))
+        _curve(axis, times[1:], 1e3 * values[1:], label, index)
     axis.set_ylabel(f"RMS distance from the {truth} [mm]")
     axis.set_xlabel("time [s]")
     axis.set_ylim(bottom=0)
@@ -185,7 +196,7 @@ def plot_error_against_time(
     figure, (axis,) = _axes(1, 4.2)
     for index, (label, (seconds, error)) in enumerate(points.items()):
         axis.loglog(
-            1e3 * seconds, (100 if relative else 1e3) * error, _MARKS[index // len(_COLOURS) % 4],
+            1e3 * seconds, (100 if relative else 1e3) * error, _MARKS[index % len(_MARKS)],
             markersize=9, label=label, color=_COLOURS[index % len(_COLOURS)],
         )  # fmt: skip
     axis.set_xlabel("time a frame [ms]")

@@ -24,11 +24,12 @@ _LINE = 1.3  # of the font size
 
 @dataclass(frozen=True)
 class ColourBar:
-    """Title, colour map and upper end of the shared colour scale."""
+    """Title, colour map and ends of the shared colour scale."""
 
     title: str
     palette: str
     limit: float
+    low: float = 0.0
 
 
 class Sheet:
@@ -36,7 +37,7 @@ class Sheet:
 
     ``labels``, row by row, may have several lines.  ``font`` is the height of the text, pixels;
     ``longest`` the last time on any page, s, which chooses the unit of times; ``key`` names and
-    their colours, in place of a bar.
+    their colours, in place of a bar; ``size`` that of the sheet, pixels, if it is not what fits.
     """
 
     def __init__(
@@ -48,17 +49,17 @@ class Sheet:
         font: float,
         longest: float = 1.0,
         key: Sequence[tuple[str, str]] = (),
+        size: tuple[int, int] | None = None,
     ) -> None:
         self._longest = longest
         figure = require_extra("matplotlib.figure", "view")
         agg = require_extra("matplotlib.backends.backend_agg", "view")
         self._view, self._labels, self._font = view, list(labels), font
-        lines = max(len(label.splitlines()) for label in labels)
         self._columns, self._gap = columns, round(0.5 * font)
-        self._caption = round((lines + 1) * _LINE * font + 1.2 * self._gap)
+        self._caption = _caption(labels, font)
         width, height = view.size
-        total = -(-len(labels) // columns) * (self._caption + height) + round(4.2 * font)
-        self.size = (_even(width * columns), _even(total))
+        total = -(-len(labels) // columns) * height + height_of_text(labels, columns, font)
+        self.size = size or (_even(width * columns), _even(total))
         self._figure = figure.Figure(figsize=(self.size[0] / 100, self.size[1] / 100), dpi=100)
         self._canvas = agg.FigureCanvasAgg(self._figure)
         self._times: list[Any] = []
@@ -136,8 +137,10 @@ class Sheet:
         """The directions x, y, z as the camera sees them."""
         origin = np.array([2.3 * self._font, self.size[1] - 1.7 * self._font])
         for index in np.argsort(self._view.axes[2]):  # the one pointing at the viewer last
+            if abs(self._view.axes[2, index]) > 0.99:  # as good as a point
+                continue
             name = "xyz"[index]
-            arrow = 1.75 * self._font * self._view.axes[:2, index] * [1, -1]
+            arrow = 1.6 * self._font * self._view.axes[:2, index] * [1, -1]
             tip, mark = origin + arrow, origin + 1.38 * arrow
             self._line([origin[0], tip[0]], [origin[1], tip[1]], _AXES[name], 0.11 * self._font)
             style = {"color": _AXES[name], "ha": "center", "va": "center"}
@@ -160,9 +163,11 @@ class Sheet:
         axes = self._figure.add_axes(
             (left / width, 1.75 * font / height, (right - left) / width, 0.75 * font / height)
         )
-        mapping = cm.ScalarMappable(colors.Normalize(0.0, bar.limit), bar.palette)
+        mapping = cm.ScalarMappable(colors.Normalize(bar.low, bar.limit), bar.palette)
         drawn = self._figure.colorbar(mapping, cax=axes, orientation="horizontal")
-        drawn.set_ticks(ticker.MaxNLocator(**_MARKS).tick_values(0.0, bar.limit))
+        marks = ticker.MaxNLocator(**_MARKS).tick_values(bar.low, bar.limit)
+        slack = 1e-9 * (bar.limit - bar.low)
+        drawn.set_ticks(marks[(marks >= bar.low - slack) & (marks <= bar.limit + slack)])
         axes.tick_params(labelsize=0.72 * 0.9 * font, length=0.25 * font, width=1, pad=2)
         drawn.outline.set_visible(False)
         self._text(left, height - 2.75 * font, bar.title, font, va="bottom")
@@ -180,6 +185,17 @@ class Sheet:
             text.set_x((left + 2.1 * font) / self.size[0])
             text.set_fontsize(0.72 * font)
             left += factor * width
+
+
+def _caption(labels: Sequence[str], font: float) -> int:
+    """Height of what is above a panel, pixels."""
+    lines = max(len(label.splitlines()) for label in labels)
+    return round((lines + 1) * _LINE * font + 1.2 * round(0.5 * font))
+
+
+def height_of_text(labels: Sequence[str], columns: int, font: float) -> int:
+    """Height of all captions and the legend, pixels."""
+    return -(-len(labels) // columns) * _caption(labels, font) + round(4.2 * font)
 
 
 def round_limit(largest: float) -> float:
@@ -205,6 +221,13 @@ def length_unit(length: float) -> tuple[float, str]:
     if length >= 1.0:
         return 1.0, "m"
     return (1e3, "mm") if length >= 1e-3 else (1e6, "µm")
+
+
+def pressure_unit(pressure: float) -> tuple[float, str]:
+    """Factor and name of the unit in which a pressure in Pa reads best."""
+    if pressure >= 1e6:
+        return 1e-6, "MPa"
+    return (1e-3, "kPa") if pressure >= 1e3 else (1.0, "Pa")
 
 
 def _even(size: int) -> int:

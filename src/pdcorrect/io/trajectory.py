@@ -29,7 +29,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from pdcorrect._files import part_of, replacing, write_bytes
+from pdcorrect._files import part_of, replacing
 from pdcorrect._version import __version__
 from pdcorrect.errors import InputError, OutputError
 from pdcorrect.io.trajectory_reader import (
@@ -41,6 +41,7 @@ from pdcorrect.io.trajectory_reader import (
     trajectory_fault,
     written_by,
 )
+from pdcorrect.io.write_lock import WriteLock
 from pdcorrect.state import State, StepResult
 from pdcorrect.trajectory import Trajectory
 
@@ -49,6 +50,11 @@ __all__ = ["TrajectoryWriter", "load_trajectory", "save_trajectory"]
 _LIBRARY = ("v110", "v110")  # readable by HDF5 1.10 and later; what the swmr mode needs
 _STATUS = h5py.string_dtype("ascii", 32)
 _FILL = {"f": np.nan, "i": -1, "S": b""}
+_REMEDIES = {
+    errno.EAGAIN: "It is open in another program: close it, or set HDF5_USE_FILE_LOCKING=FALSE.",
+    errno.ENOLCK: "The file system has no locks: set HDF5_USE_FILE_LOCKING=FALSE.",
+}
+"""Of HDF5's own locks, which it takes only where the environment says so."""
 
 
 class TrajectoryWriter:
@@ -78,7 +84,7 @@ class TrajectoryWriter:
     InputError
         If arrays contradict each other.
     OutputError
-        If the file cannot be created.
+        If the file cannot be created, or another program is writing it.
     """
 
     def __init__(
@@ -104,30 +110,24 @@ class TrajectoryWriter:
             memory={name: array[None] for name, array in initial.memory.items()},
         )
         _refuse(first)
-        self.path = Path(path)
-        _check_target(self.path, overwrite)
+        _check_target(Path(path), overwrite)
         self._shape, self._time = first.points.shape, initial.time
         self._frames = 0
         self._growing: list[str] = []  # datasets but for times
         self._broken, self._reserved = False, 0
-        with io.BytesIO() as memory:  # HDF5 may crash where a disk is full
-            with h5py.File(memory, "w", libver=_LIBRARY) as self._file:
-                self._file.attrs.update(_file_attributes(first))
-                for name, mesh in {"points": first.points, "cells": first.cells}.items():
-                    self._file.create_dataset(
-                        f"mesh/{name}", data=mesh, chunks=mesh.shape, fletcher32=True
-                    )
-                self._add(_entries(initial, {}))
-                self._write(_entries(initial, {}))
-            # under one name, which resume finds if this process is killed
-            write_bytes(self.path, memory.getvalue(), part_of(self.path))
+        with contextlib.ExitStack() as undo:
+            self._lock = undo.enter_context(WriteLock(Path(path)))
+            with io.BytesIO() as memory:  # HDF5 may crash where a disk is full
+                self._begin(memory, first, initial)
+                self._lock.write(memory.getvalue())
+            undo.pop_all()
 
     @classmethod
     def resume(cls, path: str | Path, run: Trajectory | None = None) -> TrajectoryWriter:
         """Continue a finished or interrupted file after its last complete frame.
 
-        The file, to which no other process may write, is first rewritten, without what is damaged
-        or half written; until that is done the old one stays.  ``run`` is what it is to hold before
+        The file is first rewritten, without what is damaged or half written; until that is done the
+        old one stays.  ``run`` is what it is to hold before
         the next frame; by default what ``load_trajectory(path, salvage=True)`` reads from it.
 
         Raises
@@ -137,39 +137,60 @@ class TrajectoryWriter:
         InputError
             If another version of this package wrote the file.
         OutputError
-            If the file cannot be rewritten; it is unchanged.
+            If another program is writing the file, or it cannot be rewritten; it is unchanged.
         """
         path = Path(path)
-        version = written_by(path)
-        if version != __version__:
-            raise InputError(
-                f"{path}: written by pdcorrect {version}, this is {__version__}: continue "
-                "it with the version that began it, or start again."
-            )
-        run = load_trajectory(path, salvage=True) if run is None else run
-        part_of(part_of(path)).unlink(missing_ok=True)  # of a killed process
-        try:
-            with replacing(path) as part:
-                writer = cls._written(part, run, overwrite=True)
-        except OSError as error:
-            raise OutputError(
-                f"{path}: is unchanged, but the copy to continue with failed: {error}"
-            ) from error
-        writer.path = path
+        with WriteLock(path):
+            version = written_by(path)
+            if version != __version__:
+                raise InputError(
+                    f"{path}: written by pdcorrect {version}, this is {__version__}: continue "
+                    "it with the version that began it, or start again."
+                )
+            run = load_trajectory(path, salvage=True) if run is None else run
+            part_of(part_of(path)).unlink(missing_ok=True)  # of a killed process
+            try:
+                with replacing(path) as part:
+                    writer = cls._written(part, run, overwrite=True)
+            except OSError as error:
+                raise OutputError(
+                    f"{path}: is unchanged, but the copy to continue with failed: {error}"
+                ) from error
+            writer._lock.path = path
         return writer
 
     @classmethod
     def _written(cls, path: Path, run: Trajectory, overwrite: bool) -> TrajectoryWriter:
-        """The writer of a whole trajectory, closed: it opens the file again for more."""
+        """The writer of a whole trajectory, which keeps the lock and opens the file for more."""
         _refuse(run)
-        with cls(
+        writer = cls(
             path, run.points, run.cells, run.state(0), scene_toml=run.scene_toml,
             attributes=run.attributes, overwrite=overwrite,
-        ) as writer:  # fmt: skip
+        )  # fmt: skip
+        with contextlib.ExitStack() as undo:
+            undo.enter_context(writer)
             for k in range(len(run)):
                 values = {name: array[k] for name, array in run.stats.items()}
                 writer.append_values(run.state(k + 1), values)
+            writer._finish()
+            undo.pop_all()
         return writer
+
+    def _begin(self, memory: io.BytesIO, first: Trajectory, initial: State) -> None:
+        """Write the mesh and frame 0."""
+        with h5py.File(memory, "w", libver=_LIBRARY) as self._file:
+            self._file.attrs.update(_file_attributes(first))
+            for name, mesh in {"points": first.points, "cells": first.cells}.items():
+                self._file.create_dataset(
+                    f"mesh/{name}", data=mesh, chunks=mesh.shape, fletcher32=True
+                )
+            self._add(_entries(initial, {}))
+            self._write(_entries(initial, {}))
+
+    @property
+    def path(self) -> Path:
+        """Of the file."""
+        return self._lock.path
 
     @property
     def steps(self) -> int:
@@ -198,7 +219,8 @@ class TrajectoryWriter:
         InputError
             If the state does not fit the file or is not finite.
         OutputError
-            If the disk is full or fails; the frames before are intact.
+            If the disk is full or fails; the frames before are intact.  If another program has
+            replaced the file.
         """
         values: dict[str, Any] = {name: float(value) for name, value in result.stats.items()}
         values["status"] = result.status.name
@@ -217,6 +239,7 @@ class TrajectoryWriter:
         self._check(state)
         if self._broken:
             raise OutputError(f"{self.path}: nothing more can be written after a failure.")
+        self._check_own()
         entries = _entries(state, values)
         new = {n: x for n, x in entries.items() if n not in (*self._growing, "times")}
         if new or not self._file:
@@ -227,12 +250,29 @@ class TrajectoryWriter:
         self._time = state.time
 
     def close(self) -> None:
-        """Finish the file; harmless when repeated."""
+        """Finish the file and let others write it; harmless when repeated."""
+        try:
+            self._finish()
+        finally:
+            self._lock.release()
+
+    def _finish(self) -> None:
         if self._file and not self._broken:
+            self._check_own()
             with self._reporting():
                 self._file.close()
                 if self._reserved:
                     os.truncate(self.path, file_end(self.path))
+
+    def _check_own(self) -> None:
+        """Give up a file whose name another one has by now."""
+        try:
+            self._lock.acquire()
+        except OutputError:
+            self._broken = True
+            with contextlib.suppress(OSError, RuntimeError):
+                self._file.close()
+            raise
 
     def _check(self, state: State) -> None:
         where = f"{self.path}: frame {self._frames}"
@@ -246,15 +286,15 @@ class TrajectoryWriter:
 
     def _open(self, new: Mapping[str, Any]) -> None:
         """Open the file, with more datasets; they are added to a copy that then replaces it."""
-        self.close()
+        self._finish()
         with self._reporting():
             if new:
                 with io.BytesIO(self.path.read_bytes()) as memory:
                     with h5py.File(memory, "r+", libver=_LIBRARY) as self._file:
                         self._add(new)
-                    write_bytes(self.path, memory.getvalue(), part_of(self.path))
+                    self._lock.write(memory.getvalue())
             self._reserved = 0
-            self._file = h5py.File(self.path, "r+", libver=_LIBRARY)
+            self._file = h5py.File(self.path, "r+", libver=_LIBRARY, locking=False)
             self._file.swmr_mode = True
 
     def _reserve(self, entries: Mapping[str, Any]) -> None:
@@ -313,9 +353,10 @@ class TrajectoryWriter:
                 _abandon(self._file, self.path)
             number = getattr(error, "errno", None)
             reason = " ".join(str(error).split()) if number is None else os.strerror(number)
+            remedy = _REMEDIES.get(number or 0, "Free some space or choose another place.")
             raise OutputError(
                 f"{self.path}: cannot be written ({reason}); its first {self._frames} "
-                "frames are intact. Free some space or choose another place."
+                f"frames are intact. {remedy}"
             ) from error
 
 
@@ -329,7 +370,7 @@ def save_trajectory(path: str | Path, trajectory: Trajectory, overwrite: bool = 
     OutputError
         If the file cannot be written.
     """
-    TrajectoryWriter._written(Path(path), trajectory, overwrite)
+    TrajectoryWriter._written(Path(path), trajectory, overwrite).close()
 
 
 def _refuse(trajectory: Trajectory) -> None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Annotated, Literal, Union
+from typing import Annotated, Any, Literal, Union
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,7 +32,11 @@ def _grid(cells: tuple[int, int, int]) -> NDArray[np.bool_]:
     return np.zeros(cells, dtype=bool)
 
 
-class _VoxelBody(Strict):
+class _AnyBody(Strict):
+    name: Annotated[str, Field(min_length=1)] | None = None
+
+
+class _VoxelBody(_AnyBody):
     cell_size: Positive
     origin: Vector = (0.0, 0.0, 0.0)
 
@@ -179,7 +183,8 @@ class Weight(_VoxelBody):
 class Voxels(_VoxelBody):
     """Any set of grid cells: a nested list ``occupancy[x][y][z]`` of 0 and 1.
 
-    Or the path of a NumPy file (``.npy``) of such an array, in which all but 0 is solid.
+    Or the path of a NumPy file (``.npy``) of such an array, in which all but 0 is solid; the cells
+    with one number are a group of that name.
     """
 
     shape: Literal["voxels"]
@@ -197,14 +202,23 @@ class Voxels(_VoxelBody):
 
     def occupancy(self) -> Occupancy:
         """Solid cells (nx, ny, nz), the corner at the origin."""
-        solid = _read(self.given) if isinstance(self.given, Path) else np.array(self.given, bool)
+        if isinstance(self.given, Path):
+            solid = _read(self.given)
+            solid = _grid(solid.shape) | (solid != 0)
+        else:
+            solid = np.array(self.given, dtype=bool)
         if not solid.any():
             raise SceneError("body.occupancy has no solid cells: expected at least one 1.")
         return solid, (0, 0, 0)
 
+    def labels(self) -> NDArray[np.integer[Any]] | None:
+        """The whole numbers (nx, ny, nz) of a file; None where there are but 0 and 1."""
+        labels = _read(self.given) if isinstance(self.given, Path) else None
+        return None if labels is None or labels.dtype.kind == "b" else labels
 
-def _read(path: Path) -> NDArray[np.bool_]:
-    """The solid cells of a NumPy file."""
+
+def _read(path: Path) -> NDArray[Any]:
+    """What a NumPy file holds, whole numbers or truth values (nx, ny, nz)."""
     try:
         array = np.load(path, allow_pickle=False, mmap_mode="r")
         shape, kind = array.shape, array.dtype.kind
@@ -217,10 +231,10 @@ def _read(path: Path) -> NDArray[np.bool_]:
             f"body.occupancy = {str(path)!r} holds {array.dtype} of shape {shape}: expected whole "
             "numbers or truth values of shape (x, y, z)."
         )
-    return _grid(shape) | (array != 0)
+    return array
 
 
-class MeshFile(Strict):
+class MeshFile(_AnyBody):
     """Hexahedral mesh from a file (Gmsh, Abaqus, VTK, and what meshio reads)."""
 
     shape: Literal["file"]

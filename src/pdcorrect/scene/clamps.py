@@ -83,6 +83,8 @@ class Initial(Strict):
 
     Attributes
     ----------
+    region
+        Whose nodes have these velocities; everywhere by default.
     velocity
         v, m/s.
     angular_velocity
@@ -90,12 +92,13 @@ class Initial(Strict):
     velocity_gradient
         G, rows of the derivatives of v_x, v_y, v_z by x, y, z, 1/s.
     centre
-        c, m; the centre of mass by default.
+        c, m; the centre of mass of the region by default.
     run, frame
         A trajectory file, from whose frame (-1 is the last) positions and velocities are taken;
         the velocities above are added.
     """
 
+    region: Region | None = None
     velocity: Vector = _STILL
     angular_velocity: Vector = _STILL
     velocity_gradient: tuple[Vector, Vector, Vector] = (_STILL, _STILL, _STILL)

@@ -36,7 +36,7 @@ class Region(Strict):
         Node numbers of the coarse mesh; a new node of a finer mesh or element belongs if all
         corners do of the cell, face or edge that it lies in.
     group
-        Name of a group of the mesh file.
+        Name of a body, or of a group of a mesh file.
     everywhere
         The whole body.
     """

@@ -141,6 +141,7 @@ class Scene(TomlConfig):
 
     name: str = "scene"
     body: Body
+    bodies: tuple[Body, ...] = ()
     material: Material
     materials: tuple[MaterialRegion, ...] = ()
     time: Time
@@ -175,6 +176,14 @@ class Scene(TomlConfig):
         return probes
 
     @model_validator(mode="after")
+    def _bodies_told_apart(self) -> Scene:
+        names = [body.name for body in self.all_bodies.values() if body.name is not None]
+        twice = [name for name in names if names.count(name) > 1]
+        if twice:
+            raise ValueError(f"bodies: two have the name {twice[0]!r}: expected names that differ")
+        return self
+
+    @model_validator(mode="after")
     def _motion_has_inertia(self) -> Scene:
         if self.initial is not None and self.time.integrator == "quasi-static":
             raise ValueError(
@@ -193,23 +202,19 @@ class Scene(TomlConfig):
             If the file cannot be read, is not TOML, or is not a valid scene.
         """
         scene = super().load(path)
-        named: dict[str, dict[str, Any]] = {
-            "body": {
-                "path": getattr(scene.body, "path", None),
-                "occupancy": getattr(scene.body, "given", None),
-            },
-            "initial": {"run": scene.initial and scene.initial.run},
-            "solver": {"weights": scene.solver.weights},
-        }
-        for section, keys in named.items():  # from now on absolute
-            found = {
-                key: (Path(path).parent / value).resolve()
-                for key, value in keys.items()
-                if isinstance(value, Path)
-            }
-            if found:
-                scene = scene.with_changes(**{section: found})
-        return scene
+        folder = Path(path).parent
+        changes: dict[str, Any] = {"body": _absolute(scene.body, folder)}
+        if scene.bodies:
+            changes["bodies"] = tuple(_absolute(body, folder) for body in scene.bodies)
+        for name in ("initial", "solver"):
+            if name in scene.model_fields_set:
+                changes[name] = _absolute(getattr(scene, name), folder)
+        return scene.model_copy(update=changes)
+
+    @property
+    def all_bodies(self) -> dict[str, Body]:
+        """``body`` and ``bodies``, by their keys in messages."""
+        return {"body": self.body} | {f"bodies[{i}]": body for i, body in enumerate(self.bodies)}
 
     def with_changes(self, **sections: Any) -> Scene:
         """The same scene with some sections' keys replaced, as ``material={"poisson": 0.3}``.
@@ -260,7 +265,8 @@ def trained_coarse(scene: Scene) -> Scene:
     thick somewhere, where the other bends too easily.
     """
     check_scene(scene)
-    element = "hex8-bubble" if _one_cell_thick(scene.body) else "hex8-bubble-mean"
+    thin = any(_one_cell_thick(body) for body in scene.all_bodies.values())
+    element = "hex8-bubble" if thin else "hex8-bubble-mean"
     return scene.with_changes(solver={"element": element, "mass": "averaged"})
 
 
@@ -273,6 +279,12 @@ def _one_cell_thick(body: Body) -> bool:
         bool((solid & ~np.roll(solid, 1, axis) & ~np.roll(solid, -1, axis)).any())
         for axis in range(3)
     )
+
+
+def _absolute(section: Strict, folder: Path) -> Strict:
+    """A section with paths that no longer start at a folder."""
+    found = {key: (folder / value).resolve() for key, value in section if isinstance(value, Path)}
+    return section.model_copy(update=found)
 
 
 def _plain(value: Any) -> Any:

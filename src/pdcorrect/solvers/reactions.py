@@ -152,7 +152,7 @@ def solve_mass(problem: Problem, force: Array) -> Array:
         return movable(force) / problem.mass[:, None]
     diagonal = problem.mass_matrix.diagonal()[:, None]
     found = conjugate_gradients(
-        lambda x: movable(problem.mass_times(x)),
+        lambda x: movable(problem.mass_times(x)) + diagonal * (x - movable(x)),
         movable(force),
         lambda r: r / diagonal,
         tolerance=_MASS_TOLERANCE,

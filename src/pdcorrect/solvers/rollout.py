@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import time
+import warnings
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from typing import Any, Literal
@@ -12,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdcorrect._config import parse_toml
-from pdcorrect.errors import ConvergenceError, InputError
+from pdcorrect.errors import ConvergenceError, InputError, MeshError, PdcorrectWarning
+from pdcorrect.fem.hexahedron import gauss_points, jacobians
 from pdcorrect.fem.mesh import coincident_nodes
 from pdcorrect.fem.problem import Problem
 from pdcorrect.scene import Scene
@@ -26,6 +28,10 @@ DENSITY_CHANGED = "the scene's but for its density"
 """Attribute "material" of runs of `Problem.with_total_mass`."""
 OWN_MATERIAL = "the scene's"
 """The same of most runs."""
+
+_GAINED = 0.1
+"""Of a run's largest energy: more than steps of second order gain where they are short enough."""
+_SAME_VOLUME = 1e-6
 
 OnFailure = Literal["raise", "stop", "continue"]
 
@@ -125,7 +131,8 @@ def rollout(
     Returns
     -------
     Trajectory
-        ``frames + 1`` frames, the first one the initial state.
+        ``frames + 1`` frames, the first one the initial state.  A `PdcorrectWarning` says if
+        frames have inverted cells, or energy came from nowhere.
     """
     states = [stepper.problem.initial_state() if state is None else state]
     log = StepLog()
@@ -139,7 +146,50 @@ def rollout(
     except ConvergenceError as error:
         error.trajectory = _trajectory(stepper, states, log)
         raise
-    return _trajectory(stepper, states, log)
+    run = _trajectory(stepper, states, log)
+    scene = stepper.problem.scene
+    told = [inverted_frames(run.stats, scene.time.step)]
+    if forces is None and scene.time.integrator != "quasi-static" and "kinetic_energy" in run.stats:
+        told.append(gained_energy(run.stats))
+    for text in filter(None, told):
+        warnings.warn(text, PdcorrectWarning, stacklevel=2)
+    return run
+
+
+def gained_energy(stats: Mapping[str, Any]) -> str:
+    """Whether a run has more energy than was put in since its first step; empty if not."""
+    stored = np.asarray(stats["elastic_energy"]) + np.asarray(stats["kinetic_energy"])
+    put_in = np.asarray(stats["external_work"]) + stats["clamp_work"] - stats["damping_loss"]
+    if "contact_energy" in stats:
+        stored = stored + stats["contact_energy"]
+        put_in = put_in + stats["obstacle_work"] - stats["friction_loss"]
+    if "actuator_work" in stats:
+        put_in = put_in + stats["actuator_work"]
+    put_in = np.cumsum(put_in)
+    gained = float(((stored - stored[0]) - (put_in - put_in[0])).max())
+    if not gained > _GAINED * stored.max():
+        return ""
+    return (
+        f"the run gained {gained:.3g} J that nothing put in: take smaller steps or a smaller "
+        "spectral_radius"
+    )
+
+
+def inverted_frames(stats: Mapping[str, Any], step: float) -> str:
+    """How many frames of a run ended with inverted cells, and the first one; empty if none.
+
+    ``step`` is the length of a frame, s.
+    """
+    inverted = np.asarray(stats["status"]) == Status.INVERTED.name
+    if "smallest_volume_ratio" in stats:  # also after a fallback, which the status names instead
+        inverted = inverted | (np.asarray(stats["smallest_volume_ratio"]) <= 0.0)
+    if not inverted.any():
+        return ""
+    first = 1 + int(inverted.argmax())
+    return (
+        f"{inverted.sum()} of {len(inverted)} frames ended with inverted or folded cells, the "
+        f"first at t = {first * step:g} s"
+    )
 
 
 def _trajectory(stepper: Stepper, states: list[State], log: StepLog) -> Trajectory:
@@ -220,11 +270,24 @@ def restrict(run: Trajectory, to: Problem | Trajectory) -> Trajectory:
     Raises
     ------
     MeshError
-        If a coarse node has no counterpart.
+        If a coarse node has no counterpart, or the bodies have other extents or volumes.
     """
     points, cells = (to.points if isinstance(to, Trajectory) else to.positions), to.cells
     tolerance = 1e-6 * float(np.ptp(points[cells[0]], axis=0).max())
     nodes = coincident_nodes(run.points, points, tolerance)
+    meshes = (run.points, run.cells), (points, cells)
+    own, other = (np.stack([x.min(axis=0), x.max(axis=0)]) for x, _ in meshes)
+    if np.abs(own - other).max() > tolerance:
+        raise MeshError(
+            f"the run's body extends up to {np.abs(own - other).max():.3g} m further, or less far: "
+            "expected a refinement of the same body."
+        )
+    volumes = [jacobians(x, c[:, :8], gauss_points(2)).mean(axis=1).sum() for x, c in meshes]
+    if abs(volumes[0] - volumes[1]) > _SAME_VOLUME * volumes[1]:
+        raise MeshError(
+            f"the run's body has {volumes[0]:.6g} m3, the coarser mesh {volumes[1]:.6g} m3: "
+            "expected a refinement of the same body."
+        )
     return replace(
         run,
         positions=run.positions[:, nodes],
