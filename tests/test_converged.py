@@ -170,15 +170,9 @@ def test_what_an_included_file_holds_counts(tmp_path):
     assert len({first, second, module._key(scene)}) == 3
 
 
-@pytest.mark.parametrize("key", ["occupancy", "run"])
-def test_what_other_files_of_a_scene_hold_counts(tmp_path, key):
-    path = tmp_path / "named"
-    body = {"shape": "voxels", "occupancy": str(path), "cell_size": 0.02}
+def test_what_an_earlier_run_holds_counts(tmp_path):
+    path, found = tmp_path / "run.h5", set()
     scene = beam(initial={"run": str(path)})
-    if key == "occupancy":
-        own = beam().model_dump(mode="python", exclude_unset=True, by_alias=True)
-        scene = pc.Scene(**{**own, "body": body})
-    found = set()
     for content in (b"one", b"another"):
         path.write_bytes(content)
         found |= {module._key(scene), module._key(scene)}
