@@ -56,6 +56,16 @@ def time_and_mesh_error() -> Rows:
     return ("error", "RMS, mm", "% of the displacement"), rows
 
 
+def gallery() -> Rows:
+    """Scenes of the gallery by two elements."""
+    (table,) = read(RECORDS / "gallery.json")["tables"]
+    rows = [
+        [name.replace("_", " "), str(nodes), str(frames), *map(number, found)]
+        for name, nodes, frames, *found, _ in table["rows"]
+    ]
+    return table["headings"][:-1], rows
+
+
 def own_body_evaluation() -> Rows:
     """Means over the evaluation simulations of the hook, before and after fine-tuning."""
     record = read(_OWN)
@@ -104,6 +114,6 @@ def own_body_runs() -> Rows:
 
 def tables() -> Iterator[tuple[str, Callable[[], Rows]]]:
     """By their names on the pages."""
-    every = (error_and_time, time_and_mesh_error, own_body_evaluation, own_body_runs)
+    every = (error_and_time, time_and_mesh_error, own_body_evaluation, own_body_runs, gallery)
     for table in every:
         yield table.__name__.replace("_", "-"), table

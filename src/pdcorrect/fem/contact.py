@@ -20,8 +20,9 @@ e the slip velocity times the step.  It is convex and dissipative.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property, partial
 
 import numpy as np
 import scipy.sparse as sp
@@ -71,7 +72,7 @@ class SurfacePoints:
     areas : (n,)
         At rest, m2.
     cells : (n,)
-        A cell that each point belongs to.
+        A cell that each point belongs to, in order.
     local : (n, K)
         Shape functions of that cell's nodes.
     """
@@ -105,13 +106,15 @@ def surface_points(mesh: HexMesh, space: Space, free: NDArray[np.bool_]) -> Surf
     total = np.bincount(which.ravel(), weights=areas.ravel()).astype(np.float64)
     movable = np.asarray(free.any(axis=1))
     loose = (movable[nodes[first]] & (nodes[first] >= 0)).any(axis=1)
-    first = first[loose]
+    first, total = first[loose], total[loose]
+    order = np.argsort(cells[first], kind="stable")
+    first, total = first[order], total[order]
     cells, local = cells[first], local[first]
     rows = np.repeat(np.arange(len(cells)), local.shape[1])
     entries = (local.ravel(), (rows, space.cells[cells].ravel()))
     operator = sp.csr_matrix(entries, shape=(len(cells), len(space.positions)))
     operator.eliminate_zeros()
-    return SurfacePoints(operator, total[loose], cells, local)
+    return SurfacePoints(operator, total, cells, local)
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,7 +130,12 @@ class Touching:
     force: Array
     slope: Array
     normals: Array
-    curvatures: Array
+    bend: Callable[[], Array]
+
+    @cached_property
+    def curvatures(self) -> Array:
+        """Computed where they are asked for."""
+        return self.bend()
 
     def matrices(self, project: bool = False) -> Array:
         """Second derivatives (n, 3, 3) of the energies, N/m.
@@ -141,7 +149,7 @@ class Touching:
 
 _NOTHING = Touching(
     np.zeros(0, dtype=np.int64), 0.0, np.zeros(0), np.zeros(0), np.zeros((0, 3)),
-    np.zeros((0, 3, 3)),
+    lambda: np.zeros((0, 3, 3)),
 )  # fmt: skip
 
 
@@ -180,6 +188,7 @@ class Contact:
         stiffness: float,
     ) -> None:
         self.points = points
+        self._transposed = points.operator.T.tocsr()
         self.distances = [o.distance or _DISTANCE * cell_size for o in declared]
         self.stiffnesses = [o.stiffness or stiffness for o in declared]
         self.slips = [o.slip or _SLIP * cell_size for o in declared]
@@ -235,11 +244,11 @@ class Contact:
                 continue
             areas = self.points.areas[points]
             value, first, second = barrier(gaps[points] / D)
-            with np.errstate(invalid="ignore"):
-                normals, curvatures = obstacle.slopes(x[points], time)
+            normals = obstacle.normals(x[points], time)
             force, slope = -k * areas * first, k / D * areas * second
             energy = float(k * D * (areas @ value))
-            out.append(Touching(points, energy, force, slope, normals, curvatures))
+            bend = partial(obstacle.curvatures, x[points], time)
+            out.append(Touching(points, energy, force, slope, normals, bend))
         return out
 
     def longest_step(self, x: Array, way: Array, time: float) -> float:
@@ -249,11 +258,15 @@ class Contact:
     def spread(self, values: Array, unknowns: int) -> Array:
         """Values (n, 3) at the points as nodal ones, on configurations (unknowns, 3)."""
         out = np.zeros((unknowns, 3))
-        out[: self.points.operator.shape[1]] = self.points.operator.T @ values
+        out[: self._transposed.shape[0]] = self._transposed @ values
         return out
 
     def add_to(self, blocks: Array, matrices: Array, points: Index) -> None:
         """Add matrices (m, 3, 3) of some points to those of their cells, (C, L, L, 3, 3)."""
+        if not len(points):
+            return
         local, width = self.points.local[points], self.points.local.shape[1]
         more = np.einsum("pk,pl,pij->pklij", local, local, matrices, optimize=True)
-        np.add.at(blocks[:, :width, :width], self.points.cells[points], more)
+        cells = self.points.cells[points]  # in order
+        first = np.flatnonzero(np.diff(cells, prepend=-1))
+        blocks[cells[first], :width, :width] += np.add.reduceat(more, first)

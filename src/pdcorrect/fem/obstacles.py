@@ -36,8 +36,11 @@ class _Coordinate(Protocol):
     def value(self, X: Array) -> Array:
         """(n,), m."""
 
-    def slopes(self, X: Array) -> tuple[Array, Array]:
-        """First (n, 3) and second (n, 3, 3) derivatives."""
+    def slope(self, X: Array) -> Array:
+        """First derivative, (n, 3) or (3,)."""
+
+    def curvature(self, X: Array) -> Array | float:
+        """Second derivative, (n, 3, 3) or 0."""
 
     def interval(self, X: Array, way: Array) -> tuple[Array, Array]:
         """The shares of paths X + share way between which q < 0, (n,) each; inf, -inf for none."""
@@ -55,11 +58,13 @@ class _Slab:
         along = (X - self.centre) @ self.axis
         return along if self.half is None else np.abs(along) - self.half
 
-    def slopes(self, X: Array) -> tuple[Array, Array]:
-        first = np.broadcast_to(self.axis, X.shape)
-        if self.half is not None:
-            first = np.sign((X - self.centre) @ self.axis)[:, None] * first
-        return first, np.zeros((*X.shape, 3))
+    def slope(self, X: Array) -> Array:
+        if self.half is None:
+            return self.axis
+        return np.sign((X - self.centre) @ self.axis)[:, None] * self.axis
+
+    def curvature(self, X: Array) -> float:
+        return 0.0
 
     def interval(self, X: Array, way: Array) -> tuple[Array, Array]:
         along, speed = (X - self.centre) @ self.axis, way @ self.axis
@@ -85,12 +90,15 @@ class _Radial:
     def value(self, X: Array) -> Array:
         return np.linalg.norm((X - self.centre) @ self.projection, axis=1) - self.radius
 
-    def slopes(self, X: Array) -> tuple[Array, Array]:
+    def slope(self, X: Array) -> Array:
         arm = (X - self.centre) @ self.projection
         length = np.linalg.norm(arm, axis=1)[:, None]
-        first = np.divide(arm, length, out=np.zeros_like(arm), where=length > 0.0)
+        return np.divide(arm, length, out=np.zeros_like(arm), where=length > 0.0)
+
+    def curvature(self, X: Array) -> Array:
+        first, length = self.slope(X), self.value(X) + self.radius
         second = self.projection - first[:, :, None] * first[:, None, :]
-        return first, second / np.maximum(length, 1e-300)[:, :, None]
+        return np.asarray(second / np.maximum(length, 1e-300)[:, None, None])
 
     def interval(self, X: Array, way: Array) -> tuple[Array, Array]:
         arm, speed = (X - self.centre) @ self.projection, way @ self.projection
@@ -147,26 +155,36 @@ class RigidObstacle:
     def gaps(self, x: Array, time: float) -> Array:
         """Distances of points (n, 3) from the surface, (n,), m; negative inside."""
         q = self._values(self._local(x, time))
+        if len(q) == 1:
+            return np.asarray(q[0])
         outside = np.sqrt((np.maximum(q, 0.0) ** 2).sum(axis=0))
         return np.where(outside > 0.0, outside, q.max(axis=0))
 
-    def slopes(self, x: Array, time: float) -> tuple[Array, Array]:
-        """First (n, 3) and second (n, 3, 3) derivatives of the gaps of points outside."""
-        X, (R, _) = self._local(x, time), self.frame(time)
-        shares = np.maximum(self._values(X), 0.0)
-        d = np.sqrt((shares**2).sum(axis=0))
-        shares /= d
+    def normals(self, x: Array, time: float) -> Array:
+        """First derivatives (n, 3) of the gaps of points outside."""
+        X = self._local(x, time)
+        shares, _ = self._shares(X)
+        n = np.zeros_like(X)
+        for share, coordinate in zip(shares, self._coordinates, strict=True):
+            n += share[:, None] * coordinate.slope(X)
+        return n if self._course is None else n @ self.frame(time)[0].T
+
+    def curvatures(self, x: Array, time: float) -> Array:
+        """Second derivatives (n, 3, 3) of the gaps of points outside."""
+        X = self._local(x, time)
+        shares, d = self._shares(X)
         n, H = np.zeros_like(X), np.zeros((*X.shape, 3))
         for share, coordinate in zip(shares, self._coordinates, strict=True):
-            g, second = coordinate.slopes(X)
-            n += share[:, None] * g
-            H += share[:, None, None] * second
+            H += share[:, None, None] * coordinate.curvature(X)
             if len(shares) > 1:
+                g = np.broadcast_to(coordinate.slope(X), X.shape)
+                n += share[:, None] * g
                 counted = ((share > 0.0) / d)[:, None, None]
                 H += counted * g[:, :, None] * g[:, None, :]
         if len(shares) > 1:
             H -= n[:, :, None] * n[:, None, :] / d[:, None, None]
-        return (n, H) if self._course is None else (n @ R.T, R @ H @ R.T)
+        R = self.frame(time)[0]
+        return H if self._course is None else R @ H @ R.T
 
     def first_hit(self, x: Array, way: Array, time: float) -> float:
         """The share of the paths x + share way at which a point enters; infinite if none does."""
@@ -193,6 +211,13 @@ class RigidObstacle:
     def turned(self, start: float, end: float) -> Array:
         """The rotation (3, 3) from one time to another, s."""
         return self.frame(end)[0] @ self.frame(start)[0].T
+
+    def _shares(self, X: Array) -> tuple[Array, Array]:
+        """q+ / d of each coordinate, and d, of points at X; not a number inside."""
+        shares = np.maximum(self._values(X), 0.0)
+        d = np.sqrt((shares**2).sum(axis=0))
+        d[d == 0.0] = np.nan
+        return shares / d, d
 
     def _values(self, X: Array) -> Array:
         return np.stack([coordinate.value(X) for coordinate in self._coordinates])

@@ -110,15 +110,17 @@ class ContactTerm:
         self.has_friction = any(contact.frictions)
         self.moves = any(way.any() for way in self._ways)
         self._sliding: list[Sliding] = []
+        self._last: tuple[Array, list[Touching]] | None = None
         if self.has_friction:
-            self._lag(x, self._start)
+            self._lag(x, contact.touching(x, self._start))
 
     def follow(self, y: Array) -> bool:
         """Take friction's forces and planes at a configuration; whether any act or did."""
         if not self.has_friction:
             return False
         before = self._sliding
-        self._lag(self._points(y), self._end)
+        x = self._points(y)
+        self._lag(x, self._touching(x))
         return any(len(part.points) for part in (*before, *self._sliding))
 
     def feasible(self, start: Array, free: NDArray[np.bool_]) -> Array:
@@ -163,7 +165,7 @@ class ContactTerm:
         """J and N, (N + B, 3)."""
         x, value = self._points(y), 0.0
         forces = np.zeros_like(x)
-        for part in self._contact.touching(x, self._end):
+        for part in self._touching(x):
             value += part.value
             if np.isfinite(part.value):
                 forces[part.points] += part.force[:, None] * part.normals
@@ -184,7 +186,7 @@ class ContactTerm:
     def report(self, y: Array) -> dict[str, float]:
         """Smallest gap (m); energy of the barrier, work of obstacles, loss by friction (J)."""
         x, work, loss = self._points(y), 0.0, 0.0
-        touching = self._contact.touching(x, self._end)
+        touching = self._touching(x)
         for part, way in zip(touching, self._ways, strict=True):
             work += float(np.vdot(part.force[:, None] * part.normals, way[part.points]))
         for sliding, way in zip(self._sliding, self._ways, strict=False):
@@ -208,7 +210,7 @@ class ContactTerm:
         x, at = self._points(y), self._contact.at(z)
         factor, obstacles = self._stage.load_factor, self._contact.obstacles
         ends, starts = np.zeros((2, len(obstacles), *at.shape))
-        for i, part in enumerate(self._contact.touching(x, self._end)):
+        for i, part in enumerate(self._touching(x)):
             H = part.matrices()
             ends[i, part.points] -= np.einsum("mij,mj->mi", H, at[part.points])
         for i, sliding in enumerate(self._sliding):
@@ -243,7 +245,7 @@ class ContactTerm:
         return self._stage.load_factor * out
 
     def _matrices(self, x: Array, project: bool) -> list[tuple[NDArray[np.int64], Array]]:
-        touching = self._contact.touching(x, self._end)
+        touching = self._touching(x)
         parts = [(part.points, part.matrices(project)) for part in touching]
         return parts + [(part.points, part.matrices(part.motions(x))) for part in self._sliding]
 
@@ -255,9 +257,15 @@ class ContactTerm:
     def _points(self, y: Array) -> Array:
         return self._contact.at(self._stage.moved(y[: len(self._state.positions)]))
 
-    def _lag(self, x: Array, time: float) -> None:
+    def _touching(self, x: Array) -> list[Touching]:
+        """At the end of the step; those of the last x are kept."""
+        if self._last is None or not np.array_equal(self._last[0], x):
+            self._last = x, self._contact.touching(x, self._end)
+        return self._last[1]
+
+    def _lag(self, x: Array, touching: list[Touching]) -> None:
         contact, h = self._contact, self._end - self._start
-        parts = zip(contact.frictions, contact.touching(x, time), self._carried, strict=True)
+        parts = zip(contact.frictions, touching, self._carried, strict=True)
         self._sliding = [
             Sliding(friction, part, carried, slip * h)
             for (friction, part, carried), slip in zip(parts, contact.slips, strict=True)

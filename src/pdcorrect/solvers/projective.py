@@ -13,7 +13,7 @@ from pdcorrect.errors import InputError
 from pdcorrect.fem.factorisation import Backend, NotPositiveDefinite
 from pdcorrect.fem.hyperelasticity import COROTATED
 from pdcorrect.fem.problem import Problem
-from pdcorrect.solvers.first_hessian import TrueHessian
+from pdcorrect.solvers.first_hessian import INSIDE, TrueHessian
 from pdcorrect.solvers.implicit import ImplicitStepper, whole
 from pdcorrect.solvers.minimise import MinimiserOptions, Minimum, Solve, minimise
 from pdcorrect.solvers.step import StepObjective
@@ -172,11 +172,12 @@ class ProjectiveDynamics(ImplicitStepper):
     ) -> Minimum:
         """L-BFGS; a Hessian that has not led to the minimum after a while is renewed on the way."""
         most = options.max_iterations
-        if objective.contact is not None and objective.contact.near(start):
-            patience, solver = _CONTACT_PATIENCE, hessian.renew(objective, start)
+        first = start is objective.start
+        touching = objective.contact is not None and objective.contact.near(start)
+        patience = _CONTACT_PATIENCE if touching else _PATIENCE
+        if touching and (first or hessian.age != INSIDE):
+            solver = hessian.renew(objective, start)
         else:
-            first = start is objective.start
-            patience = _PATIENCE
             solver = hessian.solver(objective) if first else hessian.at(objective, start)
         limit = min(patience, most)
         found = minimise(objective, start, solver, replace(options, max_iterations=limit))

@@ -1,0 +1,52 @@
+"""The scenes of the gallery: how far runs are from the converged motion, at what time."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import common
+
+import pdcorrect as pc
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+FRAMES = {"lifting_gripper": 12, "crawler": 12, "twisted_bar": 10, "bracket": 15}
+"""Few, for converged motions with contact take minutes."""
+MODELS = {"learned": pc.learned_coarse, "best coarse": pc.best_coarse}
+TABLE = "Scenes"
+HEADINGS = (
+    "scene", "nodes", "frames",
+    *(f"{name}, {what}" for name in MODELS for what in ("%", "ms a frame")), "smallest gap, mm",
+)  # fmt: skip
+
+
+def part(name: str) -> common.Outcome:
+    """One scene by all models."""
+    scene = pc.Scene.load(EXAMPLES / f"{name}.toml").with_changes(time={"frames": FRAMES[name]})
+    motion, row, gaps = pc.converged(scene), [], []
+    for choose in MODELS.values():
+        stepper = pc.ProjectiveDynamics(pc.discretise(choose(scene))).prepare()
+        started = time.process_time()
+        run = pc.rollout(stepper)
+        spent = 1e3 * (time.process_time() - started) / len(run)
+        row += [100.0 * pc.metrics.relative_error(run, motion), spent]
+        gaps += list(run.stats.get("smallest_gap", ()))
+    figures = {f"{name}, {model}, %": row[2 * i] for i, model in enumerate(MODELS)}
+    if gaps:
+        figures[f"{name}, smallest gap, mm"] = 1e3 * min(gaps)
+    rows = ((name, len(run.points), len(run), *row, 1e3 * min(gaps) if gaps else "–"),)
+    return common.Outcome(figures, (common.Table(TABLE, HEADINGS, rows),))
+
+
+def parts(quick: bool) -> dict[str, Callable[[], common.Outcome]]:
+    """One part a scene; a quick run has the one of the fewest cells."""
+    return {name: partial(part, name) for name in FRAMES if not quick or name == "crawler"}
+
+
+def finding(record: common.Record) -> str:
+    """How many scenes the learned element is nearer in."""
+    rows = record.table(TABLE)["rows"]
+    nearer = sum(row[3] < row[5] for row in rows)
+    return f"The learned element is nearer to the converged motion in {nearer} of {len(rows)}."

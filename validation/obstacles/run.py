@@ -1,0 +1,73 @@
+"""Hard cases of contact: by PD and Newton, no point inside an obstacle, no energy from nowhere."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from functools import partial
+
+import common
+import numpy as np
+from scenes import SCENES
+
+import pdcorrect as pc
+from pdcorrect.errors import PdcorrectWarning
+
+MODELS = {"hex8": lambda scene: scene, "best coarse": pc.best_coarse, "learned": pc.learned_coarse}
+ENERGIES = "kinetic_energy", "elastic_energy", "contact_energy"
+WORKS = "external_work", "obstacle_work", "clamp_work"
+TABLE = "Runs"
+HEADINGS = (
+    "scene", "element", "method", "status", "iterations, mean", "iterations, most",
+    "smallest gap, cells", "energy gain", "distance",
+)  # fmt: skip
+QUICK = "balls"
+
+
+def energy_gain(run: pc.Trajectory) -> float:
+    """Largest growth of the energy beyond the work of loads and obstacles, over the largest."""
+    start = 0.5 * np.vdot(run.velocities[0], run.problem.mass_times(run.velocities[0]))
+    energy = np.append(start, sum(run.stats[name] for name in ENERGIES))
+    work = sum(run.stats[name] for name in WORKS)
+    return float((np.diff(energy) - work).max() / energy.max())
+
+
+def part(name: str) -> common.Outcome:
+    """A scene by all elements and both methods; the distance is in largest displacements."""
+    figures: common.Figures = {}
+    rows = []
+    for element, choose in MODELS.items():
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", PdcorrectWarning)
+            problem = pc.discretise(choose(SCENES[name]))
+        runs = {"PD": pc.rollout(pc.ProjectiveDynamics(problem), on_failure="continue")}
+        runs["Newton"] = pc.rollout(pc.Newton(problem), on_failure="continue")
+        moved = np.linalg.norm(runs["Newton"].positions - problem.positions, axis=2).max()
+        apart = np.linalg.norm(runs["PD"].positions - runs["Newton"].positions, axis=2).max()
+        figures[f"{name}, {element}, distance"] = apart / moved
+        for method, run in runs.items():
+            gap = float(run.stats["smallest_gap"].min()) / problem.cell_size
+            statuses = run.stats["status"]
+            worst = next((s for s in statuses if not pc.Status[s].ok), str(statuses[-1]))
+            found = {"status": str(worst), "smallest gap": gap, "energy gain": energy_gain(run)}
+            figures |= {f"{name}, {element}, {method}, {key}": x for key, x in found.items()}
+            count = run.stats["iterations"]
+            rows.append(
+                (name, element, method, str(worst), float(count.mean()), int(count.max()), gap,
+                 found["energy gain"], apart / moved)
+            )  # fmt: skip
+    return common.Outcome(figures, (common.Table(TABLE, HEADINGS, tuple(rows)),))
+
+
+def parts(quick: bool) -> dict[str, Callable[[], common.Outcome]]:
+    """One part a scene."""
+    return {name: partial(part, name) for name in SCENES if not quick or name == QUICK}
+
+
+def finding(record: common.Record) -> str:
+    """The smallest gap and the most iterations."""
+    rows = record.table(TABLE)["rows"]
+    gap, most = min(row[6] for row in rows), max(row[5] for row in rows)
+    return (
+        f"In {len(rows)} runs no gap is below {gap:.2g} cells; steps take up to {most} iterations."
+    )
