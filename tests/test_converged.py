@@ -170,6 +170,15 @@ def test_what_an_included_file_holds_counts(tmp_path):
     assert len({first, second, module._key(scene)}) == 3
 
 
+def test_what_an_earlier_run_holds_counts(tmp_path):
+    path, found = tmp_path / "run.h5", set()
+    scene = beam(initial={"run": str(path)})
+    for content in (b"one", b"another"):
+        path.write_bytes(content)
+        found |= {module._key(scene), module._key(scene)}
+    assert len(found) == 2
+
+
 @pytest.mark.parametrize("damage", ["empty", "cut", "text", "folder", "short"])
 def test_damaged_entries_are_made_anew(scene, computed, cache, damage):
     first = pc.converged(scene)

@@ -48,6 +48,26 @@ def test_a_network_that_gives_nothing_leaves_the_coarse_rollout_bit_for_bit(elem
             assert np.array_equal(run.stats[name], plain.stats[name]), name
 
 
+def test_the_network_takes_one_thread_and_gives_the_others_back(monkeypatch):
+    problem = pc.discretise(soft_beam(loads=[TORSION]))
+    seen, plain = [], Corrector.of_view
+
+    def asked(self, *given):
+        seen.append(torch.get_num_threads())
+        return plain(self, *given)
+
+    monkeypatch.setattr(Corrector, "of_view", asked)
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        hybrid = HybridStepper(pc.ProjectiveDynamics(problem), fitted([problem])).prepare()
+        hybrid(problem.rest_state())
+        assert set(seen) == {1}
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(before)
+
+
 def test_network_and_gate_look_at_the_same_features(monkeypatch):
     problem = pc.discretise(soft_beam(loads=[TORSION]))
     names = (*preset("compact").node_features, "velocity")

@@ -1,7 +1,9 @@
 """Machines that keep no files, have few threads, or are busy."""
 
+import os
 import subprocess
 import sys
+from pathlib import Path
 
 import numba
 import pytest
@@ -40,6 +42,39 @@ def test_only_large_problems_take_all_threads_and_give_them_back(monkeypatch, fe
     stepper = pc.Newton(pc.discretise(beam((2, 1, 1))))
     stepper(stepper.problem.rest_state())
     assert used == ([1, most] if few else [most])
+
+
+STEPS_IN_TWO_THREADS = """
+from threading import Event, Thread
+import pdcorrect as pc
+from conftest import beam
+from pdcorrect.solvers.implicit import limited_threads
+from threadpoolctl import threadpool_info
+
+def blas():
+    return [info["num_threads"] for info in threadpool_info() if info["user_api"] == "blas"]
+
+def step():
+    with limited_threads(problem):
+        entered.set()
+        joined.wait()
+
+problem, entered, joined, before = pc.discretise(beam((2, 1, 1))), Event(), Event(), blas()
+other = Thread(target=step)
+other.start()
+entered.wait()
+with limited_threads(problem):
+    joined.set()
+    other.join()
+    assert set(blas()) == {1}
+assert blas() == before, before
+"""
+
+
+def test_blas_has_its_threads_back_after_steps_in_two():
+    paths = os.pathsep.join([str(Path(__file__).parent), *sys.path])
+    settings = {**os.environ, "OPENBLAS_NUM_THREADS": "2", "PYTHONPATH": paths}
+    subprocess.run([sys.executable, "-c", STEPS_IN_TWO_THREADS], check=True, env=settings)
 
 
 @pytest.mark.parametrize("command", ["simulate", "compare"])

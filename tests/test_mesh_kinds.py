@@ -367,6 +367,20 @@ def test_parts_of_abaqus_files_in_other_files(tmp_path, keyword, how):
         read_hex_mesh(tmp_path / "a.inp")
 
 
+@pytest.mark.parametrize(
+    "lines", ["*NSET, NSET=A, GENERATE\n5", "*INCLUDE,\nINPUT=lines.txt", "*INCLUDE"]
+)
+def test_lines_of_abaqus_that_say_too_little_are_named(tmp_path, lines):
+    with pytest.raises(MeshError, match=r"a\.inp: line \d+"):
+        read(tmp_path, "a.inp", f"{FLAT}\n{lines}\n")
+
+
+def test_a_name_of_many_digits_is_no_number(tmp_path):
+    mesh = read(tmp_path, "a.inp", f"{FLAT}\n*NSET, NSET=A\n{'9' * 5000}\n")
+    assert_two_cubes(mesh)
+    assert "A" not in mesh.groups
+
+
 def test_cylindrical_nodes_of_abaqus(tmp_path):
     radius, angle = np.hypot(*POINTS[:, :2].T), np.rad2deg(np.arctan2(POINTS[:, 1], POINTS[:, 0]))
     lines = [f"{k}, {r!r}, {a!r}, {z!r}" for k, (r, a, z) in

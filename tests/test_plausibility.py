@@ -10,6 +10,7 @@ import pdcorrect as pc
 from conftest import CLAMPED, beam
 from pdcorrect.cli.program import app
 from pdcorrect.errors import PdcorrectWarning, SceneError
+from pdcorrect.fem.clamps import Clamps, check_held
 
 QUASI_STATIC = {"step": 0.1, "frames": 1, "integrator": "quasi-static"}
 
@@ -78,6 +79,33 @@ def test_held_statics_step(clamps):
     assert stepper(stepper.problem.rest_state()).status.ok
 
 
+def test_an_obstacle_may_hold_statics():
+    floor = {"shape": "plane", "normal": [0, 0, 1], "point": [0, 0, -1e-4]}
+    weight = {"kind": "gravity", "acceleration": [0, 0, -9.81]}
+    scene = plausible(clamps=[X, Y], loads=[weight], time=QUASI_STATIC, obstacles=[floor])
+    problem = pc.discretise(scene)
+    result = pc.Newton(problem)(problem.rest_state())
+    carried = pc.contact_forces(problem, result.state).sum(axis=(0, 1))
+    np.testing.assert_allclose(carried, [0, 0, 9.81 * problem.mass.sum()], rtol=1e-6, atol=1e-9)
+
+
+def test_rounding_is_no_turn():
+    problem = pc.discretise(beam((2, 2, 2), clamps=[X, Y], time=QUASI_STATIC))
+    with pytest.raises(SceneError, match="move along z:"):
+        pc.Newton(problem)
+
+
+def test_many_clamped_nodes_are_checked_in_little_memory():
+    count = 40_000
+    places = np.random.default_rng(0).normal(size=(count, 3))
+    free = np.ones((count, 3), dtype=bool)
+    free[:, 0] = free[0, 1] = False
+    cells = np.arange(count).reshape(-1, 8)
+    cells[1:, 0] = cells[0, 0]
+    with pytest.raises(SceneError, match="move along z and turn about"):
+        check_held(places, cells, Clamps(free, places, ()))
+
+
 def test_each_part_of_a_body_needs_its_clamps():
     occupancy = [[[1]], [[0]], [[1]]]
     body = {"shape": "voxels", "occupancy": occupancy, "cell_size": 0.02}
@@ -99,3 +127,4 @@ def test_inverted_frames_end_with_status_1_unless_allowed(tmp_path, options, sta
     run = pc.load_trajectory(output)
     assert np.min(run.stats["smallest_volume_ratio"]) <= 0
     assert done.exit_code == status
+    assert CliRunner().invoke(app, [*command, "--resume"]).exit_code == status

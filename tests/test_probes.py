@@ -1,7 +1,9 @@
 """Probes and runs that start from another one's frame: places, interpolation, files, bad input."""
 
 import csv
+import shutil
 
+import h5py
 import numpy as np
 import pytest
 from typer.testing import CliRunner
@@ -47,6 +49,21 @@ def test_quadratic_fields_are_met_exactly_by_cells_with_27_nodes():
     assert found[2] == pytest.approx(0.06**2 - 3 * 0.01 * 0.02, rel=1e-10)
 
 
+@pytest.mark.parametrize("shape", ["graded", "tapered"])
+def test_points_of_cells_of_unlike_sizes_are_found(shape):
+    mesh = pc.discretise(beam((4, 4, 4), body={"cell_size": 1.0}, time={"step": 1.0})).mesh
+    x, y, z = mesh.positions.T
+    half = 0.5**z
+    positions = np.stack([x, y, z**4] if shape == "graded" else [x * half, y * half, z], axis=1)
+    rng = np.random.default_rng(3)
+    cells, local = rng.integers(len(mesh.cells), size=200), rng.uniform(size=(200, 3))
+    points = np.einsum("pk,pki->pi", trilinear(local), positions[mesh.cells[cells]])
+    found, places, distances = locate(positions, mesh.cells, points)
+    np.testing.assert_array_equal(found, cells)
+    np.testing.assert_allclose(places, local, atol=1e-9)
+    assert distances.max() < 1e-9
+
+
 def test_points_of_distorted_cells_are_found():
     rng = np.random.default_rng(3)
     mesh = pc.discretise(beam((3, 3, 2))).mesh
@@ -76,6 +93,15 @@ def test_simulate_writes_a_table(tmp_path):
     assert [float(row["time"]) for row in rows] == run.times.tolist()
     assert [float(row["end.z"]) for row in rows] == moved["end"][:, 2].tolist()
     assert moved["end"][-1, 2] < 0
+
+
+def test_a_probe_outside_is_told_before_the_run(tmp_path):
+    scene = probed(probes=[{"name": "a", "point": [9, 0, 0]}], time={"step": 0.01, "frames": 2})
+    (tmp_path / "scene.toml").write_text(scene.to_toml())
+    output = tmp_path / "run.h5"
+    done = CliRunner().invoke(app, ["simulate", str(tmp_path / "scene.toml"), "-o", str(output)])
+    assert isinstance(done.exception, SceneError) or done.exit_code == 2
+    assert not output.exists()
 
 
 @pytest.mark.parametrize(
@@ -136,6 +162,13 @@ def test_other_bodies_frames_and_files_are_refused(earlier, tmp_path):
         pc.discretise(probed(initial={"run": str(path), "frame": 7})).initial_state()
     with pytest.raises(SceneError, match=r"initial\.run.*read"):
         pc.discretise(probed(initial={"run": str(tmp_path / "none.h5")})).initial_state()
+    damaged = tmp_path / "damaged.h5"
+    shutil.copy(path, damaged)
+    with h5py.File(damaged, "r+") as file:
+        del file["positions"]
+        file["positions"] = np.zeros((5, 2))
+    with pytest.raises(SceneError, match=r"initial\.run.*read"):
+        pc.discretise(probed(initial={"run": str(damaged)})).initial_state()
     with pytest.raises(SceneError, match="frame"):
         probed(initial={"frame": 1})
     turned = probed(initial={"run": str(path)}, clamps=[{"region": {"plane": "x", "at": "max"}}])
@@ -182,8 +215,9 @@ def test_voxels_come_from_numpy_files(tmp_path):
             pc.discretise(
                 pc.Scene(**scene | {"body": {**body, "occupancy": str(tmp_path / f"{name}.npy")}})
             )
-    (tmp_path / "text.npy").write_text("no array")
-    with pytest.raises(SceneError, match=r"body\.occupancy.*read"):
-        pc.discretise(
-            pc.Scene(**scene | {"body": {**body, "occupancy": str(tmp_path / "text.npy")}})
-        )
+    for content in (b"no array", b"\x93NUMPY\x01\x00\x05\x00{{{{\n"):
+        (tmp_path / "text.npy").write_bytes(content)
+        with pytest.raises(SceneError, match=r"body\.occupancy.*read"):
+            pc.discretise(
+                pc.Scene(**scene | {"body": {**body, "occupancy": str(tmp_path / "text.npy")}})
+            )

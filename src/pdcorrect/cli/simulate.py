@@ -75,6 +75,10 @@ def simulate(
         require_extra("matplotlib", "view")
     common.tell_of_compiling()
     stepper = _make_stepper(loaded, solver, refine, learned, model, gate)
+    if loaded.probes:
+        from pdcorrect.fem.probes import probe_weights
+
+        probe_weights(stepper.problem)  # what is wrong is told before the run
     origin = getattr(stepper, "origin", None)
     if origin:
         told = "model {model} on the base {base}, trained on {dataset} with {trained_integrator}"
@@ -82,13 +86,14 @@ def simulate(
     count = frames or loaded.time.frames
     earlier = _frames_so_far(output, stepper, count) if resume else None
     before = 0 if earlier is None else len(earlier)
-    inverted = ""
-    if before < count:
+    if earlier is None or before < count:
         stats = _run(stepper, count, output, earlier, overwrite).arrays()
         for sentence in summary(stats, stepper, before):
             common.say(sentence)
-        inverted = inverted_frames(stats, loaded.time.step)
         common.say(f"wrote {output}")
+    else:
+        stats = dict(earlier.stats)
+    inverted = inverted_frames(stats, loaded.time.step)
     if loaded.probes:
         from pdcorrect.io.probes import write_probes
 

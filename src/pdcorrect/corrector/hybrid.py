@@ -19,6 +19,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from pdcorrect.batch.gpu import one_thread
 from pdcorrect.corrector.bodies import BodyGraph
 from pdcorrect.corrector.corrector import Corrector, check_corrector
 from pdcorrect.corrector.features import FeatureView, Snapshot
@@ -133,7 +134,7 @@ class HybridStepper:
         """Factorise and load everything now, so that the first step is like the others."""
         self.coarse.prepare()
         rest = self.problem.rest_state()
-        with torch.inference_mode():
+        with torch.inference_mode(), one_thread(torch.device("cpu")):
             step = SingleCoarseStep(self.coarse, self.bodies, self.velocity, rest)
             asked(step.view_of(self.problem.positions), self.corrector, self.gate)
         return self
@@ -174,7 +175,7 @@ class HybridStepper:
         previous = state.memory.get(MEMORY) if self.remembers else None
         step = SingleCoarseStep(self.coarse, self.bodies, self.velocity, before, forces, previous)
         started = time.perf_counter()
-        with torch.inference_mode():
+        with torch.inference_mode(), one_thread(torch.device("cpu")):
             found = corrected_step(step, self.corrector, self.gate)
         result, correction, reason = found.answer, found.correction.numpy(), found.reasons.item()
         after = result.state

@@ -149,6 +149,9 @@ def _key(scene: Scene) -> str:
         for name, group in sorted(mesh.groups.items()):
             content += repr((name, *(own.tolist() for own in group))).encode()
         scene = scene.model_copy(update={"body": bodies[0], "bodies": tuple(bodies[1:])})
+    if scene.initial is not None and scene.initial.run is not None:
+        with contextlib.suppress(OSError):  # discretise says what is wrong
+            content += scene.initial.run.read_bytes()
     parts = (
         scene.with_changes(name="scene").to_toml().encode(),
         content,

@@ -24,16 +24,18 @@ from pdcorrect.fem.mesh_content import Block, Content, Integers, check_once, pla
 
 Array = NDArray[np.float64]
 
-_UNREAD = {"SYSTEM", "NGEN", "NFILL", "NCOPY", "NMAP", "ELGEN", "ELCOPY", "IMPORT"}
-"""Keywords that change the mesh and are not read."""
+_UNREAD = {"SYSTEM", "NGEN", "NFILL", "NCOPY", "NMAP", "ELGEN", "ELCOPY", "IMPORT", "INCLUDE"}
+"""Keywords that change the mesh and are not read; *INCLUDE if not on one line."""
 
 _PARAMETERS = {
     "NODE": {"NSET", "SYSTEM", "INPUT"},
     "ELEMENT": {"TYPE", "ELSET", "INPUT"},
     "INSTANCE": {"NAME", "PART"},
-    "INCLUDE": {"INPUT"},
 }
 """What is read of keywords that make the mesh."""
+
+_DIGITS = 18
+"""Of the largest number of a node or element."""
 
 _HEXAHEDRON = re.compile(r"(?:C|DC|Q)3D(8|20|27)(?!\d).*")
 _OTHER_SOLID = re.compile(r"(C|DC|DCC|Q|AC|EC|EMC|COH|GK|CIN)3D\d.*|SC[68].*|CSS8.*|CCL\d.*")
@@ -271,8 +273,10 @@ def _add_set(part: _Part, keyword: _Keyword) -> None:
     members: list[str | range] = []
     for line in keyword.data:
         if "GENERATE" in own:
-            first, last, step = (*_numbers(line), 1)[:3]
-            members.append(range(first, last + 1, max(step, 1)))
+            first, *rest = _numbers(line)
+            if not rest:
+                raise line.error("expected the first and the last number, and the step.")
+            members.append(range(first, rest[0] + 1, max([1, *rest[1:2]])))
         else:
             members += (text.strip() for text in line.text.split(",") if text.strip())
     part.sets.append(_Set(name, own.get(name, ""), own.get("INSTANCE", "").upper(), members))
@@ -320,9 +324,10 @@ class _Joined:
             numbers = np.concatenate([np.zeros(0, np.int64), *(own for own, _ in nodes)])
             points += [own @ rotation.T + offset for _, own in nodes]
             labels = [np.zeros(0, np.int64)]
-            for dimension, own, rows in (each for part in parts for each in part.elements):
-                place = start + places(numbers, rows, str(self._path))
-                blocks.append(Block(_KINDS[dimension, rows.shape[1]], dimension, place))
+            found = [each for part in parts for each in part.elements]
+            placed = places(numbers, [rows for _, _, rows in found], str(self._path))
+            for (dimension, own, _), place in zip(found, placed, strict=True):
+                blocks.append(Block(_KINDS[dimension, place.shape[1]], dimension, start + place))
                 labels.append(own)
             check_once(np.concatenate(labels), f"{self._path}: element")
             self._numbers["NSET", name.upper()] = numbers, start
@@ -350,7 +355,7 @@ class _Joined:
                 continue
             owner, _, label = member.rpartition(".")
             owner = owner.upper() or scope
-            if label.isdecimal():
+            if label.isdecimal() and len(label) <= _DIGITS:
                 labels[owner].append(int(label))
             elif (known := self._sets.get((added.kind, owner, label.upper()))) is not None:
                 found.append(known)

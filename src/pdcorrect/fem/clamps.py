@@ -270,10 +270,11 @@ def check_held(positions: Array, cells: NDArray[np.int64], clamps: Clamps) -> No
             own = motions.reshape(-1, 3, 6)[np.isin(nodes, one.nodes)]
             rows.append(np.einsum("i,nij->nj", one.normal, own))
         held = np.concatenate(rows)
-        loose = la.null_space(held, rcond=_RIGID) if len(held) else np.eye(6)
+        triangle = np.linalg.qr(held, mode="r")  # few rows, whatever the number of clamped nodes
+        loose = la.null_space(triangle, rcond=_RIGID) if len(held) else np.eye(6)
         if not loose.size:
             continue
-        turns = loose[3:]
+        turns = np.where(np.abs(loose[3:]) > _RIGID, loose[3:], 0.0)
         moves = loose[:3] @ la.null_space(turns, rcond=_RIGID)
         told = [
             f"{verb} {' and '.join(_directions(space))}"

@@ -312,9 +312,10 @@ def _content(
 ) -> Content:
     """Elements in VTK order, and groups by name, or by number where they have none."""
     blocks, members, start = [], defaultdict(list), 0
-    for (kind, dimension, _), nodes, groups in found:
+    placed = places(numbers, [each.nodes for each in found], str(path))
+    for ((kind, dimension, _), _, groups), nodes in zip(found, placed, strict=True):
         nodes = nodes[:, _VTK_ORDER[kind]] if kind in _VTK_ORDER else nodes
-        blocks.append(Block(kind, dimension, places(numbers, nodes, str(path))))
+        blocks.append(Block(kind, dimension, nodes))
         for group, own in groups.items():
             members[names.get((dimension, group), str(group))].append(start + own)
         start += len(nodes)

@@ -79,11 +79,17 @@ def _read(path: Path, frame: int) -> tuple[Array, NDArray[np.int64], Array, Arra
                 np.array(file[name][range(count)[frame]], dtype=np.float64)
                 for name in ("positions", "velocities")
             )
+            points = np.array(file["mesh/points"], dtype=np.float64)
+            if not points.shape == positions.shape == velocities.shape == (len(points), 3):
+                raise ValueError(f"{positions.shape} positions of {points.shape} nodes")
             text = file.attrs.get("scene_toml", b"")
             scene_toml = text.decode() if isinstance(text, bytes) else str(text)
-            return file["mesh/points"][:], file["mesh/cells"][:], positions, velocities, scene_toml
-    except (OSError, KeyError) as error:
+            return points, file["mesh/cells"][:], positions, velocities, scene_toml
+    except SceneError:
+        raise
+    except Exception as error:  # HDF5 raises nearly every type on damaged bytes
         raise SceneError(
             f"initial.run = {str(path)!r} cannot be read ({error}): expected a trajectory file, as "
-            "of pdcorrect simulate."
+            "of pdcorrect simulate, of a run that has ended (simulate --resume ends one that was "
+            "killed)."
         ) from None

@@ -12,6 +12,8 @@ Array = NDArray[np.float64]
 
 _CANDIDATES = 27
 """Cells whose centres are nearest: with distorted cells the right one may not be the first."""
+_ROUNDING = 1e-9
+"""Of the largest cell: how far off a point may be that counts as found."""
 _NEWTON = 20
 
 
@@ -31,17 +33,32 @@ def locate(
     """
     count = min(_CANDIDATES, len(cells))
     _, near = cKDTree(positions[cells].mean(axis=1)).query(points, k=count)
-    near = near.reshape(len(points), count)
-    corners = positions[cells[near]]  # (P, c, 8, 3)
+    found = _best(positions[cells], points, near.reshape(len(points), count))
+    low, high = positions[cells].min(axis=1), positions[cells].max(axis=1)
+    far = found[2] > _ROUNDING * np.abs(high - low).max()
+    for p in np.flatnonzero(far):  # of cells of very unlike sizes
+        around = np.flatnonzero(((low <= points[p]) & (points[p] <= high)).all(axis=1))
+        if len(around):
+            better = _best(positions[cells], points[p : p + 1], around[None])
+            if better[2][0] < found[2][p]:
+                for all_points, one in zip(found, better, strict=True):
+                    all_points[p] = one[0]
+    return found
+
+
+def _best(
+    corners: Array, points: Array, near: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], Array, Array]:
+    """The same, of the cells ``near`` each point (P, c), for corners (C, 8, 3) of all cells."""
+    corners = corners[near]
     local = _inverted(corners, np.broadcast_to(points[:, None], (*near.shape, 3)))
     local = np.clip(local, 0.0, 1.0)
     way = np.einsum("pck,pcki->pci", trilinear(local), corners) - points[:, None]
     distances = np.linalg.norm(way, axis=2)
     best = distances.argmin(axis=1)[:, None]
-    chosen = np.take_along_axis(local, best[..., None], axis=1)[:, 0]
     return (
         np.take_along_axis(near, best, axis=1)[:, 0],
-        chosen,
+        np.take_along_axis(local, best[..., None], axis=1)[:, 0],
         np.take_along_axis(distances, best, axis=1)[:, 0],
     )
 
@@ -60,6 +77,7 @@ def _inverted(corners: Array, points: Array) -> Array:
         others = [factors[..., [j for j in range(3) if j != i]].prod(axis=-1) for i in range(3)]
         slopes = np.stack(others, axis=-1) * sign  # (..., 8, 3)
         J = np.einsum("...ki,...kj->...ij", corners, slopes)
+        J[np.linalg.det(J) == 0.0] = np.eye(3)  # beyond a cell that tapers to a point there
         rest = points - np.einsum("...k,...ki->...i", factors.prod(axis=-1), corners)
         step = np.linalg.solve(J, rest[..., None])[..., 0]
         local = np.clip(local + step, -1.0, 2.0)  # cells that are far off do not matter

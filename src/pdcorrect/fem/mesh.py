@@ -54,7 +54,7 @@ class Group(NamedTuple):
         return Group(
             (self.cells[:, None] * k**3 + np.arange(k**3)).ravel(),
             np.stack([cell[face] * k**3 + child, side[face]], axis=1),
-            np.flatnonzero(_all_corners(weights, self.nodes)),
+            np.flatnonzero(_all_corners(weights, self.nodes)) if len(self.nodes) else self.nodes,
         )
 
 

@@ -40,7 +40,7 @@ def check_once(numbers: Integers, what: str) -> None:
         raise MeshError(f"{what} {found[counts.argmax()]} comes twice: expected it once.")
 
 
-def places(numbers: Integers, wanted: Integers, what: str) -> Integers:
+def places(numbers: Integers, wanted: list[Integers], what: str) -> list[Integers]:
     """Where each of ``wanted`` stands in ``numbers``, which may be sparse and in any order.
 
     Raises
@@ -51,11 +51,14 @@ def places(numbers: Integers, wanted: Integers, what: str) -> Integers:
     check_once(numbers, f"{what}: node")
     order = np.argsort(numbers)
     ordered = numbers[order]
-    place = np.searchsorted(ordered, wanted)
-    missing = np.append(ordered, -1)[place] != wanted
+    every = np.concatenate([np.zeros(0, np.int64), *(part.ravel() for part in wanted)])
+    place = np.searchsorted(ordered, every)
+    missing = np.append(ordered, -1)[place] != every
     if missing.any():
         raise MeshError(
             f"{what}: its elements refer to nodes that the file does not hold, such as "
-            f"{wanted[missing].flat[0]}: expected every node of an element in the file."
+            f"{every[missing][0]}: expected every node of an element in the file."
         )
-    return np.asarray(order[place], dtype=np.int64)
+    ends = np.cumsum([part.size for part in wanted])
+    found = np.split(order[place], ends[:-1])
+    return [own.reshape(part.shape) for own, part in zip(found, wanted, strict=False)]

@@ -174,7 +174,7 @@ class Problem(ElasticBody):
                     PdcorrectWarning,
                     stacklevel=3,
                 )
-            return start, np.where(self.free, speed + wanted, self._clamp_velocities)
+            return start, self._led(speed + wanted)
         if wanted[~self.free].any():
             warnings.warn(
                 "initial: some of the nodes that it sets in motion are clamped; their clamped "
@@ -182,12 +182,14 @@ class Problem(ElasticBody):
                 PdcorrectWarning,
                 stacklevel=3,
             )
-        return self.positions, np.where(self.free, wanted, self._clamp_velocities)
+        return self.positions, self._led(wanted)
 
-    @property
-    def _clamp_velocities(self) -> Array:
+    def _led(self, velocities: Array) -> Array:
+        """Those of the clamps in the first step where components are clamped."""
         h = self.time_step
-        return (self.clamped_positions(h) - self.clamped_positions(0.0)) / h
+        led = (self.clamped_positions(h) - self.clamped_positions(0.0)) / h
+        velocities = np.where(self.free, velocities, led)
+        return velocities if self.rollers is None else self.rollers.led(velocities, 0.0, h)
 
     # --- loads and clamps ---------------------------------------------------------
 
@@ -348,7 +350,7 @@ def problem_from_body(scene: Scene, refine: int, body: ElasticBody) -> Problem:
         young = max([scene.material.young, *(part.young or 0.0 for part in scene.materials)])
         contact = Contact(scene.obstacles, points, space.positions, body.cell_size, young)
     fibres = Fibres.of(scene.actuators, body, selector) if scene.actuators else None
-    rollers = Rollers.of(clamps.oblique, body) if clamps.oblique else None
+    rollers = Rollers.of(clamps, body) if clamps.oblique else None
     problem = Problem(
         body.mesh, space, quadrature, materials, body.cell_size, scene, refine, matrix, clamps,
         loads, contact, fibres, rollers, correction=correction,

@@ -10,18 +10,21 @@ held exactly instead, see `clamps`.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pdcorrect.fem.clamps import ObliqueClamp
+from pdcorrect.fem.clamps import Clamps, ObliqueClamp
 from pdcorrect.fem.elastic_body import ElasticBody
 
 Array = NDArray[np.float64]
 
 _STIFFER = 1e6
 """Than the body at a node."""
+_ALIKE = 1e-9
+"""Relative size of what is new in a direction that others hold already."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,8 +34,8 @@ class Rollers:
     Attributes
     ----------
     clamps : tuple of ObliqueClamp
-    rest : (N, 3)
-        Rest positions of all nodes, m.
+    rest, free : (N, 3)
+        Rest positions of all nodes, m, and the components that no other clamp holds.
     nodes, normals : (m,), (m, 3)
         Of the springs.
     stiffness : (m,)
@@ -43,6 +46,7 @@ class Rollers:
 
     clamps: tuple[ObliqueClamp, ...]
     rest: Array
+    free: NDArray[np.bool_]
     nodes: NDArray[np.int64]
     normals: Array
     stiffness: Array
@@ -51,14 +55,17 @@ class Rollers:
     at_end: ClassVar[bool] = True
 
     @classmethod
-    def of(cls, clamps: tuple[ObliqueClamp, ...], body: ElasticBody) -> Rollers:
+    def of(cls, clamps: Clamps, body: ElasticBody) -> Rollers:
         """Those of a body's clamps."""
-        nodes = np.concatenate([clamp.nodes for clamp in clamps])
-        normals = np.concatenate([np.tile(c.normal, (len(c.nodes), 1)) for c in clamps])
+        oblique = clamps.oblique
+        nodes = np.concatenate([clamp.nodes for clamp in oblique])
+        normals = np.concatenate([np.tile(c.normal, (len(c.nodes), 1)) for c in oblique])
         own = body.laplacian().diagonal()[nodes]
         assembly = body.assembly
         cells, corners = np.divmod(assembly.slots[assembly.start[nodes]], assembly.cells.shape[1])
-        return cls(clamps, body.positions, nodes, normals, _STIFFER * own, cells, corners)
+        return cls(
+            oblique, clamps.rest, clamps.free, nodes, normals, _STIFFER * own, cells, corners
+        )
 
     def energy(self, u: Array, time: float) -> float:
         """J, for displacements u (N, 3), m."""
@@ -80,19 +87,39 @@ class Rollers:
         return self
 
     def led(self, velocities: Array, start: float, end: float) -> Array:
-        """Velocities (N, 3), m/s, across the rollers' planes their means from start to end."""
-        out = self.along(velocities)
-        for clamp in self.clamps:
+        """Velocities (N, 3), m/s, that along all clamps are their means from start to end."""
+        places, _, inverse = self._constraints
+        rates = np.zeros((len(places), inverse.shape[2]))
+        rates[:, -3:] = velocities[places] * ~self.free[places]
+        for k, clamp in enumerate(self.clamps):
             way = clamp.displacements(self.rest, end) - clamp.displacements(self.rest, start)
-            out[clamp.nodes] += (way @ clamp.normal / (end - start))[:, None] * clamp.normal
+            rates[np.searchsorted(places, clamp.nodes), k] = way @ clamp.normal / (end - start)
+        out = self.along(velocities)
+        out[places] += np.einsum("rik,rk->ri", inverse, rates)
         return out
 
     def along(self, x: Array) -> Array:
-        """X (N, 3) without its parts across the planes in which rollers may move."""
+        """X (N, 3) without what clamps hold at the rollers' nodes, of other clamps too."""
+        places, ways, _ = self._constraints
         out = x.copy()
-        for clamp in self.clamps:
-            out[clamp.nodes] -= (out[clamp.nodes] @ clamp.normal)[:, None] * clamp.normal
+        out[places] = np.einsum("rki,rkj,rj->ri", ways, ways, x[places])
         return out
+
+    @cached_property
+    def _constraints(self) -> tuple[NDArray[np.int64], Array, Array]:
+        """Nodes (r,), unit vectors in which they may move (r, 3, 3), zero for those in which they
+        may not, and the pseudo-inverse (r, 3, clamps + 3) of what holds them.
+
+        A node may be on several rollers, whose normals need not be orthogonal.
+        """
+        places = np.unique(self.nodes)
+        rows = np.zeros((len(places), len(self.clamps) + 3, 3))
+        for k, clamp in enumerate(self.clamps):
+            rows[np.searchsorted(places, clamp.nodes), k] = clamp.normal
+        rows[:, -3:] = np.eye(3) * ~self.free[places][:, None]
+        _, sizes, ways = np.linalg.svd(rows)
+        ways = np.asarray(ways * (sizes <= _ALIKE * sizes[:, :1])[:, :, None], dtype=np.float64)
+        return places, ways, np.asarray(np.linalg.pinv(rows, rcond=_ALIKE), dtype=np.float64)
 
     def apply(self, x: Array) -> Array:
         """The second derivative times x (N + B, 3)."""

@@ -222,7 +222,7 @@ def _read(path: Path) -> NDArray[Any]:
     try:
         array = np.load(path, allow_pickle=False, mmap_mode="r")
         shape, kind = array.shape, array.dtype.kind
-    except (OSError, ValueError, EOFError, AttributeError) as error:
+    except Exception as error:  # NumPy raises nearly every type on damaged bytes
         raise SceneError(
             f"body.occupancy = {str(path)!r} cannot be read ({error}): expected a NumPy file, .npy."
         ) from None

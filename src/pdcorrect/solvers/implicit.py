@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -106,7 +107,7 @@ class ImplicitStepper:
         self.integrator = time.integrator if integrator is None else integrator
         viscous = problem.scene.damping.viscosity > 0.0
         self.integrate = make_integrator(self.integrator, time.spectral_radius, viscous)
-        if self.integrator == "quasi-static":
+        if self.integrator == "quasi-static" and problem.contact is None:  # which may hold it
             check_held(problem.positions, problem.cells, problem.clamps)
         within = self.tolerance * problem.cell_size
         if problem.contact is not None:
@@ -318,6 +319,8 @@ class ImplicitStepper:
         accelerations = (end.velocities - before.velocities) / part * self.problem.free
         if self.problem.contact is not None:
             loads = loads + contact_forces(self.problem, end, before).sum(axis=0)
+        if self.problem.rollers is not None:
+            loads += self.problem.rollers.forces(end.positions - self.problem.positions, end.time)
         internal = self.problem.mass_times(accelerations) - loads
         known = {
             "accelerations": accelerations,
@@ -364,8 +367,8 @@ def _outcome(
     after = stage.finish(y[:nodes], forces + reaction)
     moved = after.positions - state.positions
     if rollers is not None and objective.attached is not None:
-        pushed = unbalanced * problem.free + objective.attached.end_forces(y)
-        reaction = reaction + pushed - rollers.along(pushed)
+        pushed = unbalanced + objective.attached.end_forces(y)
+        reaction = pushed - rollers.along(pushed * problem.free)
     ends_at_y = stage.gain == 1.0  # otherwise the modes at the end are other ones
     end = y if ends_at_y else problem.relaxed(after.positions)
     attached = [one.energy(end[:nodes] - problem.positions, stage.end) for one in problem.attached]
@@ -400,6 +403,27 @@ def _threadpools() -> ThreadpoolController:
     return ThreadpoolController()
 
 
+class _OneThread:
+    """BLAS on one thread, as long as any Python thread is inside; as it was after the last."""
+
+    _lock, _inside, _limit = threading.Lock(), 0, None
+
+    def __enter__(self) -> None:
+        with self._lock:
+            if not self._inside:
+                self._limit = _threadpools().limit(limits=1, user_api="blas")
+            self._inside += 1
+
+    def __exit__(self, *error: object) -> None:
+        with self._lock:
+            self._inside -= 1
+            if not self._inside and self._limit is not None:
+                self._limit.restore_original_limits()
+
+
+_one_blas_thread = _OneThread()
+
+
 @contextmanager
 def limited_threads(problem: Problem) -> Iterator[None]:
     """BLAS on one thread, and the kernels of small problems too.
@@ -409,7 +433,7 @@ def limited_threads(problem: Problem) -> Iterator[None]:
     another program has its core (``benchmarks``, case threads).
     """
     before = numba.get_num_threads()
-    with _threadpools().limit(limits=1, user_api="blas"):
+    with _one_blas_thread:
         if problem.quadrature.weights.size < _SHARED_POINTS:
             numba.set_num_threads(1)
         try:

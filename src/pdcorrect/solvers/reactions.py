@@ -57,11 +57,9 @@ def reactions(
     else:
         accelerations = nodal_array(problem, "accelerations", accelerations)
     missing = problem.mass_times(accelerations) - acting
-    out = np.where(problem.free, 0.0, missing)
-    if rollers is not None:
-        missing *= problem.free
-        out += missing - rollers.along(missing)
-    return out
+    if rollers is None:
+        return np.where(problem.free, 0.0, missing)
+    return np.asarray(missing - rollers.along(missing * problem.free))
 
 
 def contact_forces(problem: Problem, state: State, before: State | None = None) -> Array:
