@@ -14,7 +14,7 @@ IMAGES = ROOT / "docs" / "images"
 SCENES = (
     "lifting_gripper", "crawler", "pressure_finger", "dropped_jelly", "twisted_bar", "bracket",
 )  # fmt: skip
-COLOURS = 96
+COLOURS = 256
 
 
 def main(folder: Path = IMAGES) -> None:
