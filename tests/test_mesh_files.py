@@ -266,6 +266,7 @@ def test_abaqus_cells_of_twenty_nodes_on_two_lines(tmp_path):
         ("C3D8R", "C3D27", "C3D27"),
         ("C3D8R", "C3D6", "C3D6"),
         ("C3D8R", "SC8R", "SC8R"),
+        ("C3D8R", "U8", "U8"),
         (" 12,   18,   20,", " 12,   18,", "line 25,.* 7 nodes"),
         ("12,   18,   20", " 3,   18,   20", "element 3"),
     ],

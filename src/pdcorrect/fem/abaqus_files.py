@@ -38,7 +38,7 @@ _DIGITS = 18
 """Of the largest number of a node or element."""
 
 _HEXAHEDRON = re.compile(r"(?:C|DC|Q)3D(8|20|27)(?!\d).*")
-_OTHER_SOLID = re.compile(r"(C|DC|DCC|Q|AC|EC|EMC|COH|GK|CIN)3D\d.*|SC[68].*|CSS8.*|CCL\d.*")
+_OTHER_SOLID = re.compile(r"(C|DC|DCC|Q|AC|EC|EMC|COH|GK|CIN)3D\d.*|SC[68].*|CSS8.*|CCL\d.*|V?U\d+")
 _SKIN = re.compile(r"(?:S|DS|CPS|CPE|CAX|M3D|SFM3D|R3D|F3D)([489])(?!\d).*")
 _KINDS = {
     (3, 8): "hexahedron", (3, 20): "hexahedron20", (3, 27): "hexahedron27",
