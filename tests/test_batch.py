@@ -16,7 +16,7 @@ from pdcorrect.batch import decomposition, gpu
 from pdcorrect.batch.cells import DistinctBodies
 from pdcorrect.batch.points import Points
 from pdcorrect.batch.triton_kernels import skinny_product
-from pdcorrect.errors import ConvergenceError, InputError, SceneError
+from pdcorrect.errors import ConvergenceError, InputError
 from pdcorrect.fem import energies
 from pdcorrect.fem.decomposition import nearest_volume_lanes
 from pdcorrect.fem.hyperelasticity import energy_code
@@ -453,16 +453,12 @@ def test_materials_out_of_range_are_refused_and_leave_the_stepper_alone(name, va
 
 
 def test_a_scene_without_a_minimum_fails_alone():
-    """No clamps and hardly any inertia."""
-    loose = {"clamps": [], "material": {"density": 1e-6}}
-    scenes = [beam((2, 1, 1), time={"step": 1e10}, **more) for more in ({}, loose)]
+    scenes = [beam((2, 1, 1)), beam((2, 1, 1), clamps=[])]
     problems = [pc.discretise(s) for s in scenes]
     for recover in (False, True):
-        stepper = pc.BatchStepper(problems, integrator="backward-euler", recover=recover)
+        stepper = pc.BatchStepper(problems, integrator="quasi-static", recover=recover)
         statuses = stepper(stepper.rest_state()).statuses
         assert [s.ok for s in statuses] == [True, False]
-    with pytest.raises(SceneError, match=r"scene 1 .*turn about"):
-        pc.BatchStepper(problems, integrator="quasi-static")
 
 
 def test_steps_of_another_length_start_bdf2_anew():

@@ -22,8 +22,7 @@ from torch import Tensor
 from pdcorrect.batch.correction import BatchCorrection
 from pdcorrect.batch.gpu import assembled, at_corners, in_cells, sums
 from pdcorrect.batch.points import Points, Tangent
-from pdcorrect.errors import InputError, SceneError
-from pdcorrect.fem.clamps import check_held
+from pdcorrect.errors import InputError
 from pdcorrect.fem.problem import Problem
 from pdcorrect.fem.quadrature import Quadrature
 
@@ -379,11 +378,6 @@ def check_problems(
                     f"scene {scene_name(problems, i)} has {what}, which batches do not know: "
                     "expected none. Step it by ProjectiveDynamics or Newton."
                 )
-        if (integrator or problem.scene.time.integrator) == "quasi-static":
-            try:
-                check_held(problem.positions, problem.cells, problem.clamps)
-            except SceneError as error:
-                raise SceneError(f"scene {scene_name(problems, i)}: {error}") from None
         for name in names:
             mine, theirs = (attrgetter(name)(scene) for scene in (problem.scene, first))
             if mine != theirs:

@@ -45,8 +45,8 @@ class SingleRetry:
         for i, status in enumerate(result.statuses):
             if status in _WORTH_IT:
                 state, push = state_of(self._cells, before, i), self._push(i, forces)
-                stepper = self._stepper(i, now(i))
                 try:
+                    stepper = self._stepper(i, now(i))
                     step = stepper(state, push)
                 except PdcorrectError:
                     continue  # the batch's own status stands
