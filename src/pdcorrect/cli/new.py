@@ -29,7 +29,7 @@ density = 1000.0
 [time]
 step = 0.01
 frames = 60
-#: integrator = "quasi-static"
+#: integrator = "midpoint"
 
 [damping]
 viscosity = 0.002  # s

@@ -294,4 +294,5 @@ def _directions(space: Array) -> list[str]:
     named = [name for name, is_in in zip("xyz", inside, strict=True) if is_in]
     if len(named) == space.shape[1]:
         return named
-    return [str((column / np.abs(column).max()).round(3).tolist()) for column in space.T]
+    scaled = [(column / np.abs(column).max()).round(3) + 0.0 for column in space.T]  # no -0.0
+    return [str(column.tolist()) for column in scaled]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from pdcorrect._config import Strict, Vector
 from pdcorrect.scene.regions import Region
@@ -23,9 +23,16 @@ class Probe(Strict):
         Mean over boundary faces for a plane, over nodes for a list of nodes, over cells otherwise.
     """
 
-    name: Annotated[str, Field(min_length=1, pattern=r"^[^,\r\n\"]*$")]
+    name: Annotated[str, Field(min_length=1)]
     point: Vector | None = None
     region: Region | None = None
+
+    @field_validator("name")
+    @classmethod
+    def _heads_a_column(cls, name: str) -> str:
+        if set(name) & set(',"\r\n'):
+            raise ValueError("expected a name without commas, quotes and line breaks")
+        return name
 
     @model_validator(mode="after")
     def _one_place(self) -> Probe:
