@@ -174,7 +174,7 @@ def iteration(length: str, refine: str, rules: str, first_hessian: str) -> dict[
     state = problem.rest_state()
     loads = problem.external_forces(0.0, 0.01)
     objective = StepObjective(problem, state, backward_euler(problem, state, 0.01), loads)
-    with limited_threads(problem):
+    with limited_threads():
         if first_hessian == "rest":
             solve: Any = TrueHessian(TangentFactory(problem), lagged=False).solver(objective)
         else:

@@ -10,7 +10,6 @@ import pytest
 
 import pdcorrect as pc
 from conftest import beam
-from pdcorrect.solvers import implicit
 
 WITHOUT_A_CACHE = """
 import warnings
@@ -34,20 +33,23 @@ def test_kernels_run_where_none_can_be_kept():
     subprocess.run([sys.executable, "-c", WITHOUT_A_CACHE], check=True)
 
 
-@pytest.mark.parametrize("few", [True, False])
-def test_only_large_problems_take_all_threads_and_give_them_back(monkeypatch, few):
-    monkeypatch.setattr(implicit, "_SHARED_POINTS", 10**9 if few else 0)
+@pytest.mark.parametrize(("others", "asked", "limited"), [(0, None, 0), (9, None, 1), (9, "2", 0)])
+def test_steps_take_one_thread_on_a_busy_machine_and_give_the_others_back(
+    monkeypatch, others, asked, limited
+):
+    monkeypatch.setattr(os, "getloadavg", lambda: (float(others + os.cpu_count() - 1),))
+    monkeypatch.delenv("NUMBA_NUM_THREADS", raising=False)
+    if asked:
+        monkeypatch.setenv("NUMBA_NUM_THREADS", asked)
     monkeypatch.setattr(numba, "set_num_threads", lambda n: used.append(n))
     used, most = [], numba.get_num_threads()
     stepper = pc.Newton(pc.discretise(beam((2, 1, 1))))
     stepper(stepper.problem.rest_state())
-    assert used == ([1, most] if few else [most])
+    assert used == [1] * limited + [most]
 
 
 STEPS_IN_TWO_THREADS = """
 from threading import Event, Thread
-import pdcorrect as pc
-from conftest import beam
 from pdcorrect.solvers.implicit import limited_threads
 from threadpoolctl import threadpool_info
 
@@ -55,15 +57,15 @@ def blas():
     return [info["num_threads"] for info in threadpool_info() if info["user_api"] == "blas"]
 
 def step():
-    with limited_threads(problem):
+    with limited_threads():
         entered.set()
         joined.wait()
 
-problem, entered, joined, before = pc.discretise(beam((2, 1, 1))), Event(), Event(), blas()
+entered, joined, before = Event(), Event(), blas()
 other = Thread(target=step)
 other.start()
 entered.wait()
-with limited_threads(problem):
+with limited_threads():
     joined.set()
     other.join()
     assert set(blas()) == {1}

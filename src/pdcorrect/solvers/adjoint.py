@@ -121,7 +121,7 @@ def adjoint(
     state, h = stepper.accepted(state, forces, time_step)
     integrate = stepper.integrate.held(state, h)
     step = TakenStep(stepper, state, remembered, forces, h, integrate, solver, tolerance)
-    with limited_threads(stepper.problem):
+    with limited_threads():
         y = step_solution(step.objective(h), integrate, h, result)
         return Gradients(step, checked, y)
 

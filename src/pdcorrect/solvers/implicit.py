@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import threading
 from collections import Counter
 from collections.abc import Iterator
@@ -40,8 +41,8 @@ _FALLBACK_ITERATIONS = 60
 _SUBSTEP_LEVELS = 4
 _OF_DISTANCE = 2e-5
 """Of an obstacle's distance: largest tolerance, as contact forces change fast within it."""
-_SHARED_POINTS = 4000
-"""Quadrature points from which the kernels take more than one thread."""
+_SLACK = 0.5
+"""Of the machine's load, which this program is part of."""
 _LARGEST = 1e30
 
 
@@ -140,7 +141,7 @@ class ImplicitStepper:
             If shapes are wrong or a number is not finite.
         """
         state, h = self.accepted(state, forces, time_step)
-        with limited_threads(self.problem):
+        with limited_threads():
             return self._step(state, forces, h)
 
     def accepted(
@@ -172,7 +173,7 @@ class ImplicitStepper:
 
     def prepare(self) -> Self:
         """Factorise and load the kernels now, so that the first step is like the others."""
-        with limited_threads(self.problem):
+        with limited_threads():
             rest = self.problem.rest_state()
             objective = self.objective(rest, None, self.time_step)
             objective.value_and_gradient(objective.start)
@@ -425,21 +426,28 @@ _one_blas_thread = _OneThread()
 
 
 @contextmanager
-def limited_threads(problem: Problem) -> Iterator[None]:
-    """BLAS on one thread, and the kernels of small problems too.
+def limited_threads() -> Iterator[None]:
+    """BLAS on one thread, and the kernels too on a busy machine.
 
     Idle BLAS threads spin and take the kernels' cores, and the products here are too small to gain
-    from them.  Kernels of small problems gain little from a second thread, and lose much where
-    another program has its core (``benchmarks``, case threads).
+    from them.  Kernels on two threads take up to twice as long as on one where other programs want
+    the cores, and two thirds where none does (``benchmarks``, case busy).
     """
     before = numba.get_num_threads()
     with _one_blas_thread:
-        if problem.quadrature.weights.size < _SHARED_POINTS:
+        if _busy():
             numba.set_num_threads(1)
         try:
             yield
         finally:
             numba.set_num_threads(before)
+
+
+def _busy() -> bool:
+    """Whether programs want more cores than there are, and no number of threads was asked for."""
+    if "NUMBA_NUM_THREADS" in os.environ or not hasattr(os, "getloadavg"):
+        return False
+    return os.getloadavg()[0] > (os.cpu_count() or 1) + _SLACK
 
 
 def whole(name: str, value: int, least: int = 0) -> int:
