@@ -23,31 +23,37 @@ class Assembly:
 
     def __init__(self, cells: NDArray[np.int64], count: int) -> None:
         self.cells = cells
-        self._count = count
+        self.count = count
         flat = cells.ravel()
         self.start = np.concatenate([[0], np.cumsum(np.bincount(flat, minlength=count))])
         self.slots = np.argsort(flat, kind="stable")
 
     def check(self, x: Array) -> None:
         """Refuse a nodal vector that is not (N, 3)."""
-        if np.shape(x) != (self._count, 3):
-            raise InputError(f"x {np.shape(x)}: expected ({self._count}, 3), one row a node.")
+        if np.shape(x) != (self.count, 3):
+            raise InputError(f"x {np.shape(x)}: expected ({self.count}, 3), one row a node.")
+
+    def gathered(self, values: Array) -> Array:
+        """Sum cell-wise nodal values (C, K, 3) at the nodes, (N, 3)."""
+        out = np.empty((self.count, 3))
+        kernels.gather_nodes(self.count, self.start, self.slots, values.reshape(-1, 3), out)
+        return out
 
     def matrix(self, blocks: Array) -> sp.csr_matrix:
         """Sum cell-wise node blocks (C, K, K, 3, 3) into (3N, 3N)."""
         indptr, indices, place = self._pattern
         data = np.zeros((len(indices), 3, 3))
         kernels.add_blocks(place, blocks.reshape(-1, 3, 3), data)
-        size = 3 * self._count
+        size = 3 * self.count
         return sp.bsr_matrix((data, indices, indptr), shape=(size, size)).tocsr()
 
     @cached_property
     def _pattern(self) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int64]]:
         """Block rows and columns, and the place of each cell's node pair among them."""
         rows, columns = node_pairs(self.cells)
-        keys, place = np.unique(rows * self._count + columns, return_inverse=True)
-        indptr = np.searchsorted(keys, np.arange(self._count + 1) * self._count)
-        return indptr.astype(np.int32), (keys % self._count).astype(np.int32), place.ravel()
+        keys, place = np.unique(rows * self.count + columns, return_inverse=True)
+        indptr = np.searchsorted(keys, np.arange(self.count + 1) * self.count)
+        return indptr.astype(np.int32), (keys % self.count).astype(np.int32), place.ravel()
 
 
 def node_pairs(cells: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

@@ -14,7 +14,6 @@ from pdcorrect.fem import turned_strains
 from pdcorrect.fem.assembly import Assembly
 from pdcorrect.fem.cube_symmetry import PATTERNS
 from pdcorrect.fem.hexahedron import VTK_CORNERS, shape_derivatives
-from pdcorrect.fem.kernels import gather_nodes
 from pdcorrect.fem.operators import freeze
 from pdcorrect.fem.turned_strains import SHARES
 
@@ -76,14 +75,15 @@ class CellCorrection:
         """1/2 z . K z - shift . z (J) and its forces (N, 3) for displacements (N or more, 3)."""
         energy, by_cell = np.empty(len(self.cells)), np.empty((*self.cells.shape, 3))
         turned_strains.energy_and_forces(
-            u, self.cells, self.shapes, self.sizes, self.matrices, shift, energy, by_cell
-        )
+            len(energy), u, self.cells, self.shapes, self.sizes, self.matrices, shift, energy,
+            by_cell,
+        )  # fmt: skip
         return float(energy.sum()), self._gathered(u, by_cell)
 
     def strains(self, u: Array) -> Array:
         """z, (C, 18), m."""
         out = np.empty((len(self.cells), 18))
-        turned_strains.strains(u, self.cells, self.shapes, self.sizes, out)
+        turned_strains.strains(len(out), u, self.cells, self.shapes, self.sizes, out)
         return out
 
     def tangent(
@@ -98,7 +98,7 @@ class CellCorrection:
         part = self if cells == slice(None) else self.of_cells(cells)
         out = np.empty((len(part.cells), 21, 21))
         turned_strains.tangents(
-            u, part.cells, part.shapes, part.sizes, part.matrices, shift, project, out
+            len(out), u, part.cells, part.shapes, part.sizes, part.matrices, shift, project, out
         )
         return CorrectionTangent(part, out)
 
@@ -178,12 +178,8 @@ class CellCorrection:
 
     def _gathered(self, u: Array, by_cell: Array) -> Array:
         """Summed at the nodes; zero for what else u has."""
-        out = np.empty_like(u)
-        assembly = self.assembly
-        gather_nodes(
-            assembly.start, assembly.slots, by_cell.reshape(-1, 3), out[: len(assembly.start) - 1]
-        )
-        out[len(assembly.start) - 1 :] = 0.0
+        out = np.zeros_like(u)
+        out[: self.assembly.count] = self.assembly.gathered(by_cell)
         return out
 
     @cached_property
@@ -224,13 +220,13 @@ class CorrectionTangent:
         correction = self.correction
         by_cell = np.empty((*correction.cells.shape, 3))
         turned_strains.apply_tangents(
-            x, correction.cells, correction.shapes, self.matrices, by_cell
+            len(by_cell), x, correction.cells, correction.shapes, self.matrices, by_cell
         )
         return correction._gathered(x, by_cell)
 
     def add_to(self, blocks: Array) -> None:
         """Add the cells' matrices to blocks (C, L, L, 3, 3) of nodes, N/m."""
-        turned_strains.add_blocks(self.matrices, self.correction.shapes, blocks)
+        turned_strains.add_blocks(len(blocks), self.matrices, self.correction.shapes, blocks)
 
 
 def cell_shapes(corners: Array) -> tuple[Array, Array]:

@@ -55,11 +55,13 @@ class Linearisation:
     def apply(self, x: Array) -> Array:
         """Tangent times x, both (N, 3), without assembling."""
         self.assembly.check(x)
-        assembly, out = self.assembly, np.empty_like(x)
+        cells = self.assembly.cells
+        by_cell = np.empty((*cells.shape, 3))
         kernels.apply_linearised(
-            x, assembly.cells, self.quadrature.lanes, self.left, self.right, self.tangent,
-            np.empty((*assembly.cells.shape, 3)), assembly.start, assembly.slots, out,
+            len(cells), x, cells, self.quadrature.lanes, self.left, self.right, self.tangent,
+            by_cell,
         )  # fmt: skip
+        out = self.assembly.gathered(by_cell)
         return out if self.correction is None else out + self.correction.apply(x)
 
     def blocks(self) -> Array:
@@ -67,7 +69,7 @@ class Linearisation:
         count, width = self.assembly.cells.shape
         blocks = np.empty((count, width, width, 3, 3))
         kernels.cell_stiffness(
-            self.assembly.cells, self.quadrature.lanes, self.left, self.right, self.tangent, blocks
+            count, self.quadrature.lanes, self.left, self.right, self.tangent, blocks
         )
         if self.correction is not None:
             self.correction.add_to(blocks)
@@ -152,7 +154,7 @@ class ElasticBody:
         if modes is not None:
             x[len(positions) :] = modes
         internal_modes.relax(
-            self.materials.model, x, self.space.local, self.cells.shape[1],
+            len(self.cells), self.materials.model, x, self.space.local, self.cells.shape[1],
             self.quadrature.lanes, self.point_weights, self.quadrature.first_volume,
             steps, (_RELAXED if tolerance is None else tolerance) * self.cell_size,
             _NEAR * self.cell_size,
@@ -212,14 +214,13 @@ class ElasticBody:
 
         For displacements u (N + B, 3), m, and ``weights`` like `point_weights`.
         """
-        assembly, quadrature = self.assembly, self.quadrature
-        energy, by_cell = np.empty(len(assembly.cells)), np.empty((*assembly.cells.shape, 3))
-        forces = np.empty_like(u)
+        cells, quadrature = self.space.local, self.quadrature
+        energy, by_cell = np.empty(len(cells)), np.empty((*cells.shape, 3))
         kernels.energy_and_forces(
-            self.materials.model, u, assembly.cells, quadrature.lanes, weights,
-            quadrature.first_volume, energy, by_cell, assembly.start, assembly.slots, forces,
+            len(cells), self.materials.model, u, cells, quadrature.lanes, weights,
+            quadrature.first_volume, energy, by_cell,
         )  # fmt: skip
-        return energy, by_cell, forces
+        return energy, by_cell, self.assembly.gathered(by_cell)
 
     def volume_ratios(self, positions: Array) -> Array:
         """Smallest det F over the quadrature points of each cell, (C,).
@@ -230,7 +231,7 @@ class ElasticBody:
         self._check(positions, len(self.positions))
         out = np.empty(len(self.cells))
         kernels.smallest_determinants(
-            positions - self.positions, self.cells, self.quadrature.lanes, out
+            len(out), positions - self.positions, self.cells, self.quadrature.lanes, out
         )
         return out
 
@@ -262,9 +263,8 @@ class ElasticBody:
         tangent = np.empty((count, 12, lanes))
         u = self._displacement(configuration)
         kernels.linearise_cells(
-            self.materials.model, u, assembly.cells,
-            quadrature.lanes, self.point_weights[cells], quadrature.first_volume,
-            project, left, right, tangent,
+            count, self.materials.model, u, assembly.cells, quadrature.lanes,
+            self.point_weights[cells], quadrature.first_volume, project, left, right, tangent,
         )  # fmt: skip
         correction = None
         if self.correction is not None:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 from numpy.typing import NDArray
 
 from pdcorrect.fem.assembly import scatter
+from pdcorrect.fem.cell_loops import CellLoop
 from pdcorrect.fem.decomposition import OPTIONS, scratch, signed_svd_lanes
 from pdcorrect.fem.energies import principal_stress_lanes, principal_tangent_lanes, stress_lanes
-from pdcorrect.fem.kernels import CHUNK, PARALLEL, deformation, nodal_forces, stiffness, total
+from pdcorrect.fem.kernels import deformation, nodal_forces, stiffness, total
 
 Array = NDArray[np.float64]
 
@@ -18,9 +19,9 @@ _CHORD = 100.0
 """Times ``near``: length of a step after which the next one tries the same tangent first."""
 
 
-@njit(**PARALLEL)
+@CellLoop
 def relax(  # type: ignore[no-untyped-def]
-    model, u, cells, nodes, gradients, weights, first, steps, tolerance, near
+    begin, end, model, u, cells, nodes, gradients, weights, first, steps, tolerance, near
 ):
     """Bring the internal modes in u (N + B, 3) to equilibrium with the nodes, in place.
 
@@ -34,57 +35,55 @@ def relax(  # type: ignore[no-untyped-def]
     ``nodes`` is the number of nodes a cell; its other local shape functions are modes.
     Other arguments as `kernels.energy_and_forces`.
     """
-    count, lanes = cells.shape[0], weights.shape[2]
-    width = cells.shape[1] - nodes
-    for chunk in prange((count + CHUNK - 1) // CHUNK):
-        F, U, V, B, S, s, v, k = scratch(lanes)
-        P, A, T = np.empty((9, lanes)), np.empty((9, lanes)), np.empty((12, lanes))
-        t, density = np.empty((3, lanes)), np.empty(lanes)
-        forces, old, step = np.empty((width, 3)), np.empty((width, 3)), np.empty((width, 3))
-        K, flat = np.empty((width, 3, width, 3)), step.reshape(3 * width, 1)
-        M = K.reshape(3 * width, 3 * width)
-        for c in range(chunk * CHUNK, min(count, (chunk + 1) * CHUNK)):
-            modes, here = cells[c, nodes:], gradients[c, nodes:]
-            shear, volume = weights[c, 0], weights[c, 1]
-            start = first if volume[lanes - 1] > 0.0 else lanes
-            energy, scale, tried, cut = np.inf, 1.0, 0, False
-            for _ in range(steps + _BACKTRACKS):
-                deformation(u, cells[c], gradients[c], 1.0, F)
-                signed_svd_lanes(F, U, s, V, B, S)
-                principal_stress_lanes(model, s, v, k, shear, volume, start, density, t)
-                new = total(density)
-                if not new <= energy + 1e-13 * abs(energy):
-                    scale *= 0.5
-                    cut = True
-                    if scale < 1e-6:
-                        for m in range(width):
-                            u[modes[m]] = old[m]
-                        break
+    lanes, width = weights.shape[2], cells.shape[1] - nodes
+    F, U, V, B, S, s, v, k = scratch(lanes)
+    P, A, T = np.empty((9, lanes)), np.empty((9, lanes)), np.empty((12, lanes))
+    t, density = np.empty((3, lanes)), np.empty(lanes)
+    forces, old, step = np.empty((width, 3)), np.empty((width, 3)), np.empty((width, 3))
+    K, flat = np.empty((width, 3, width, 3)), step.reshape(3 * width, 1)
+    M = K.reshape(3 * width, 3 * width)
+    for c in range(begin, end):
+        modes, here = cells[c, nodes:], gradients[c, nodes:]
+        shear, volume = weights[c, 0], weights[c, 1]
+        start = first if volume[lanes - 1] > 0.0 else lanes
+        energy, scale, tried, cut = np.inf, 1.0, 0, False
+        for _ in range(steps + _BACKTRACKS):
+            deformation(u, cells[c], gradients[c], 1.0, F)
+            signed_svd_lanes(F, U, s, V, B, S)
+            principal_stress_lanes(model, s, v, k, shear, volume, start, density, t)
+            new = total(density)
+            if not new <= energy + 1e-13 * abs(energy):
+                scale *= 0.5
+                cut = True
+                if scale < 1e-6:
                     for m in range(width):
-                        u[modes[m]] = old[m] + scale * step[m]
-                    continue
-                if tried == steps or (tried > 0 and _largest(step) <= tolerance):
+                        u[modes[m]] = old[m]
                     break
-                tried += 1
-                energy, scale = new, 1.0
-                stress_lanes(U, t, V, P)
-                nodal_forces(P, here, -1.0, forces)
-                last = np.inf if tried == 1 or cut else _largest(step)
-                cut = False
-                if last <= _CHORD * near:
-                    step[:] = forces
-                    _substitute(M, flat)
-                if not (last <= _CHORD * near and _largest(step) <= 0.1 * last):
-                    for cautious in (last > near, True):
-                        principal_tangent_lanes(model, s, v, k, shear, volume, start, cautious, T)
-                        stiffness(here, U, V, T, A, P, K)
-                        if _factorise(M, 1e-12) or cautious:
-                            break
-                    step[:] = forces
-                    _substitute(M, flat)
                 for m in range(width):
-                    old[m] = u[modes[m]]
-                    u[modes[m]] = old[m] + step[m]
+                    u[modes[m]] = old[m] + scale * step[m]
+                continue
+            if tried == steps or (tried > 0 and _largest(step) <= tolerance):
+                break
+            tried += 1
+            energy, scale = new, 1.0
+            stress_lanes(U, t, V, P)
+            nodal_forces(P, here, -1.0, forces)
+            last = np.inf if tried == 1 or cut else _largest(step)
+            cut = False
+            if last <= _CHORD * near:
+                step[:] = forces
+                _substitute(M, flat)
+            if not (last <= _CHORD * near and _largest(step) <= 0.1 * last):
+                for cautious in (last > near, True):
+                    principal_tangent_lanes(model, s, v, k, shear, volume, start, cautious, T)
+                    stiffness(here, U, V, T, A, P, K)
+                    if _factorise(M, 1e-12) or cautious:
+                        break
+                step[:] = forces
+                _substitute(M, flat)
+            for m in range(width):
+                old[m] = u[modes[m]]
+                u[modes[m]] = old[m] + step[m]
 
 
 @njit(**OPTIONS)
@@ -137,39 +136,37 @@ def _substitute(M, x):  # type: ignore[no-untyped-def]
             x[i, b] /= M[i, i]
 
 
-@njit(**PARALLEL)
-def _eliminate(blocks, nodes, shift, condensed, inverse, solved):  # type: ignore[no-untyped-def]
-    """Fill K_uu - K_ub K_bb^-1 K_bu, K_bb^-1 and K_bb^-1 K_bu; whether all K_bb are positive."""
-    count, width = blocks.shape[:2]
+@CellLoop
+def _eliminate(  # type: ignore[no-untyped-def]
+    begin, end, blocks, nodes, shift, condensed, inverse, solved, positive
+):
+    """Fill K_uu - K_ub K_bb^-1 K_bu, K_bb^-1, K_bb^-1 K_bu and whether K_bb is positive."""
+    width = blocks.shape[1]
     m, n = 3 * (width - nodes), 3 * nodes
-    failed = np.zeros(count, dtype=np.int64)
-    for chunk in prange((count + CHUNK - 1) // CHUNK):
-        K, right = np.empty((m, m)), np.empty((m, m + n))
-        for c in range(chunk * CHUNK, min(count, (chunk + 1) * CHUNK)):
-            for i in range(m):
-                k, a = nodes + i // 3, i % 3
-                for j in range(m):
-                    K[i, j] = blocks[c, k, nodes + j // 3, a, j % 3]
-                    right[i, j] = 1.0 if i == j else 0.0
-                for j in range(n):
-                    right[i, m + j] = blocks[c, k, j // 3, a, j % 3]
-            largest = 0.0
-            for i in range(m):
-                largest = max(largest, K[i, i])
-            for i in range(m):
-                K[i, i] += shift * largest
-            if not _factorise(K, 0.0):
-                failed[c] = 1
-            _substitute(K, right)
-            inverse[c] = right[:, :m]
-            solved[c] = right[:, m:]
-            for i in range(n):
-                for j in range(n):
-                    value = blocks[c, i // 3, j // 3, i % 3, j % 3]
-                    for b in range(m):
-                        value -= blocks[c, nodes + b // 3, i // 3, b % 3, i % 3] * right[b, m + j]
-                    condensed[c, i // 3, j // 3, i % 3, j % 3] = value
-    return failed.sum() == 0
+    K, right = np.empty((m, m)), np.empty((m, m + n))
+    for c in range(begin, end):
+        for i in range(m):
+            k, a = nodes + i // 3, i % 3
+            for j in range(m):
+                K[i, j] = blocks[c, k, nodes + j // 3, a, j % 3]
+                right[i, j] = 1.0 if i == j else 0.0
+            for j in range(n):
+                right[i, m + j] = blocks[c, k, j // 3, a, j % 3]
+        largest = 0.0
+        for i in range(m):
+            largest = max(largest, K[i, i])
+        for i in range(m):
+            K[i, i] += shift * largest
+        positive[c] = _factorise(K, 0.0)
+        _substitute(K, right)
+        inverse[c] = right[:, :m]
+        solved[c] = right[:, m:]
+        for i in range(n):
+            for j in range(n):
+                value = blocks[c, i // 3, j // 3, i % 3, j % 3]
+                for b in range(m):
+                    value -= blocks[c, nodes + b // 3, i // 3, b % 3, i % 3] * right[b, m + j]
+                condensed[c, i // 3, j // 3, i % 3, j % 3] = value
 
 
 class Condensed:
@@ -199,7 +196,9 @@ class Condensed:
         self.blocks = np.empty((count, nodes, nodes, 3, 3))
         self._inverse = np.empty((count, m, m))
         self._solved = np.empty((count, m, 3 * nodes))
-        if not _eliminate(blocks, nodes, shift, self.blocks, self._inverse, self._solved):
+        positive = np.empty(count, dtype=np.bool_)
+        _eliminate(count, blocks, nodes, shift, self.blocks, self._inverse, self._solved, positive)
+        if not positive.all():
             raise np.linalg.LinAlgError("the modes of a cell have an indefinite tangent")
 
     def reduced(self, r: Array) -> Array:

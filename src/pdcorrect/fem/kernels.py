@@ -6,8 +6,9 @@ import os
 from typing import Any
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
+from pdcorrect.fem.cell_loops import CHUNK, CellLoop
 from pdcorrect.fem.decomposition import OPTIONS, scratch, signed_svd_lanes
 from pdcorrect.fem.energies import principal_stress_lanes, principal_tangent_lanes, stress_lanes
 
@@ -15,11 +16,7 @@ from pdcorrect.fem.energies import principal_stress_lanes, principal_tangent_lan
 # takes longer as soon as other processes want the cores (benchmarks, case threads).
 os.environ.setdefault("GOMP_SPINCOUNT", "10000")
 
-PARALLEL: dict[str, Any] = {**OPTIONS, "parallel": True}
 REDUCE: dict[str, Any] = {**OPTIONS, "fastmath": {"contract", "nsz", "reassoc"}}
-CHUNK = 16
-"""Cells that one thread takes at a time."""
-
 _LANES = 32
 """Quadrature points that are decomposed together: 32 take half the time of four times 8."""
 
@@ -67,10 +64,10 @@ def total(a):  # type: ignore[no-untyped-def]
     return out
 
 
-@njit(**PARALLEL)
-def gather_nodes(start, slots, values, out):  # type: ignore[no-untyped-def]
+@CellLoop
+def gather_nodes(begin, end, start, slots, values, out):  # type: ignore[no-untyped-def]
     """out[n] = sum of values[slot] over the slots of node n, see `Assembly`."""
-    for n in prange(len(start) - 1):
+    for n in range(begin, end):
         x, y, z = 0.0, 0.0, 0.0
         for i in range(start[n], start[n + 1]):
             slot = slots[i]
@@ -82,8 +79,13 @@ def gather_nodes(start, slots, values, out):  # type: ignore[no-untyped-def]
 
 @njit(**OPTIONS)
 def block_shape(points):  # type: ignore[no-untyped-def]
-    """Cells of ``points`` quadrature points in a block, and its lanes."""
-    cells = max(1, (2 * _LANES + points) // (2 * points))  # about _LANES of them
+    """Cells of ``points`` quadrature points in a block, and its lanes.
+
+    A power of two, so that blocks are the same whatever the number of threads.
+    """
+    cells = CHUNK
+    while cells > 1 and 2 * cells * points > 3 * _LANES:
+        cells //= 2
     return cells, (cells * points + _WIDTH - 1) // _WIDTH * _WIDTH
 
 
@@ -142,99 +144,90 @@ def first_volume_lane(first, points, w):  # type: ignore[no-untyped-def]
     return lanes
 
 
-@njit(**PARALLEL)
+@CellLoop
 def energy_and_forces(  # type: ignore[no-untyped-def]
-    model, u, cells, gradients, weights, first, energy, by_cell, start, slots, out
+    begin, end, model, u, cells, gradients, weights, first, energy, by_cell
 ):
-    """Elastic energy (C,), J, of each cell, and forces out (N, 3), N, at displacements u (N, 3), m.
+    """Elastic energy (C,), J, of each cell, and its forces (C, K, 3), N, at displacements u (N, 3).
 
     ``model`` is an `energy_code`; ``weights`` (C, 2, Q), J, are mu and omega times rest volume; for
-    points below ``first`` there is no volume term and no volume projection is computed; by_cell
-    (C, K, 3) is scratch.
+    points below ``first`` there is no volume term and no volume projection is computed.
     """
-    count, points = cells.shape[0], weights.shape[2]
+    points = weights.shape[2]
     size, lanes = block_shape(points)
-    for chunk in prange((count + CHUNK - 1) // CHUNK):
-        F, U, V, B, S, s, v, k = scratch(lanes)
-        P, t, w = np.empty((9, lanes)), np.empty((3, lanes)), np.empty((2, lanes))
-        density, part, one = np.empty((1, lanes)), np.empty((1, points)), np.empty((9, points))
-        last = min(count, (chunk + 1) * CHUNK)
-        for begin in range(chunk * CHUNK, last, size):
-            end = min(last, begin + size)
-            fill(u, cells, gradients, weights, begin, end, first, one, F, w)
-            signed_svd_lanes(F, U, s, V, B, S)
-            lane = first_volume_lane(first, points, w)
-            principal_stress_lanes(model, s, v, k, w[0], w[1], lane, density[0], t)
-            stress_lanes(U, t, V, P)
-            for c in range(begin, end):
-                take(density, c - begin, size, first, part)
-                energy[c] = total(part[0])
-                take(P, c - begin, size, first, one)
-                nodal_forces(one, gradients[c], -1.0, by_cell[c])
-    gather_nodes(start, slots, by_cell.reshape(-1, 3), out)
+    F, U, V, B, S, s, v, k = scratch(lanes)
+    P, t, w = np.empty((9, lanes)), np.empty((3, lanes)), np.empty((2, lanes))
+    density, part, one = np.empty((1, lanes)), np.empty((1, points)), np.empty((9, points))
+    for low in range(begin, end, size):
+        high = min(end, low + size)
+        fill(u, cells, gradients, weights, low, high, first, one, F, w)
+        signed_svd_lanes(F, U, s, V, B, S)
+        lane = first_volume_lane(first, points, w)
+        principal_stress_lanes(model, s, v, k, w[0], w[1], lane, density[0], t)
+        stress_lanes(U, t, V, P)
+        for c in range(low, high):
+            take(density, c - low, size, first, part)
+            energy[c] = total(part[0])
+            take(P, c - low, size, first, one)
+            nodal_forces(one, gradients[c], -1.0, by_cell[c])
 
 
-@njit(**PARALLEL)
-def smallest_determinants(u, cells, gradients, out):  # type: ignore[no-untyped-def]
+@CellLoop
+def smallest_determinants(begin, end, u, cells, gradients, out):  # type: ignore[no-untyped-def]
     """Smallest det F of each cell, out (C,), of the nodes' displacements u alone."""
-    count, lanes = cells.shape[0], gradients.shape[3]
-    for chunk in prange((count + CHUNK - 1) // CHUNK):
-        F = np.empty((9, lanes))
-        for c in range(chunk * CHUNK, min(count, (chunk + 1) * CHUNK)):
-            deformation(u, cells[c], gradients[c], 1.0, F)
-            least = np.inf
-            for q in range(lanes):
-                determinant = (
-                    F[0, q] * (F[4, q] * F[8, q] - F[5, q] * F[7, q])
-                    + F[1, q] * (F[5, q] * F[6, q] - F[3, q] * F[8, q])
-                    + F[2, q] * (F[3, q] * F[7, q] - F[4, q] * F[6, q])
-                )
-                least = min(least, determinant)
-            out[c] = least
+    lanes = gradients.shape[3]
+    F = np.empty((9, lanes))
+    for c in range(begin, end):
+        deformation(u, cells[c], gradients[c], 1.0, F)
+        least = np.inf
+        for q in range(lanes):
+            determinant = (
+                F[0, q] * (F[4, q] * F[8, q] - F[5, q] * F[7, q])
+                + F[1, q] * (F[5, q] * F[6, q] - F[3, q] * F[8, q])
+                + F[2, q] * (F[3, q] * F[7, q] - F[4, q] * F[6, q])
+            )
+            least = min(least, determinant)
+        out[c] = least
 
 
-@njit(**PARALLEL)
+@CellLoop
 def linearise_cells(  # type: ignore[no-untyped-def]
-    model, u, cells, gradients, weights, first, project, left, right, tangent
+    begin, end, model, u, cells, gradients, weights, first, project, left, right, tangent
 ):
     """Everything the tangent needs at displacements u, for each cell.
 
     Writes ``left`` and ``right`` (C, 9, Q), the factors U and V of the signed
     SVD, and ``tangent`` (C, 12, Q), see `finish_tangent_lanes`, in J.
     """
-    count, points = cells.shape[0], weights.shape[2]
+    points = weights.shape[2]
     size, lanes = block_shape(points)
-    for chunk in prange((count + CHUNK - 1) // CHUNK):
-        F, U, V, B, S, s, v, k = scratch(lanes)
-        T, w, one = np.empty((12, lanes)), np.empty((2, lanes)), np.empty((9, points))
-        last = min(count, (chunk + 1) * CHUNK)
-        for begin in range(chunk * CHUNK, last, size):
-            end = min(last, begin + size)
-            fill(u, cells, gradients, weights, begin, end, first, one, F, w)
-            signed_svd_lanes(F, U, s, V, B, S)
-            lane = first_volume_lane(first, points, w)
-            principal_tangent_lanes(model, s, v, k, w[0], w[1], lane, project, T)
-            for c in range(begin, end):
-                take(U, c - begin, size, first, left[c])
-                take(V, c - begin, size, first, right[c])
-                take(T, c - begin, size, first, tangent[c])
+    F, U, V, B, S, s, v, k = scratch(lanes)
+    T, w, one = np.empty((12, lanes)), np.empty((2, lanes)), np.empty((9, points))
+    for low in range(begin, end, size):
+        high = min(end, low + size)
+        fill(u, cells, gradients, weights, low, high, first, one, F, w)
+        signed_svd_lanes(F, U, s, V, B, S)
+        lane = first_volume_lane(first, points, w)
+        principal_tangent_lanes(model, s, v, k, w[0], w[1], lane, project, T)
+        for c in range(low, high):
+            take(U, c - low, size, first, left[c])
+            take(V, c - low, size, first, right[c])
+            take(T, c - low, size, first, tangent[c])
 
 
-@njit(**PARALLEL)
+@CellLoop
 def apply_linearised(  # type: ignore[no-untyped-def]
-    x, cells, gradients, left, right, tangent, by_cell, start, slots, out
+    begin, end, x, cells, gradients, left, right, tangent, by_cell
 ):
-    """Tangent times x (N, 3), out (N, 3); other arguments as `energy_and_forces`."""
-    count, lanes = cells.shape[0], tangent.shape[2]
-    for chunk in prange((count + CHUNK - 1) // CHUNK):
-        D, A = np.empty((9, lanes)), np.empty((9, lanes))
-        for c in range(chunk * CHUNK, min(count, (chunk + 1) * CHUNK)):
-            deformation(x, cells[c], gradients[c], 0.0, D)
-            transform(left[c], D, right[c], A, True)
-            _tangent_product(tangent[c], A)
-            transform(left[c], A, right[c], D, False)
-            nodal_forces(D, gradients[c], 1.0, by_cell[c])
-    gather_nodes(start, slots, by_cell.reshape(-1, 3), out)
+    """Tangent times x (N, 3), by cell (C, K, 3); other arguments as `linearise_cells`."""
+    lanes = tangent.shape[2]
+    D, A = np.empty((9, lanes)), np.empty((9, lanes))
+    for c in range(begin, end):
+        deformation(x, cells[c], gradients[c], 0.0, D)
+        transform(left[c], D, right[c], A, True)
+        _tangent_product(tangent[c], A)
+        transform(left[c], A, right[c], D, False)
+        nodal_forces(D, gradients[c], 1.0, by_cell[c])
 
 
 @njit(**OPTIONS)
@@ -281,21 +274,20 @@ def _tangent_product(T, A):  # type: ignore[no-untyped-def]
             A[3 * j + i, q] = T[6 + pair, q] * y + T[9 + pair, q] * x
 
 
-@njit(**PARALLEL)
-def cell_stiffness(cells, gradients, left, right, tangent, out):  # type: ignore[no-untyped-def]
+@CellLoop
+def cell_stiffness(begin, end, gradients, left, right, tangent, out):  # type: ignore[no-untyped-def]
     """Tangent stiffness of each cell as node blocks, out (C, L, L, 3, 3), N/m."""
-    count, width, lanes = cells.shape[0], cells.shape[1], tangent.shape[2]
-    for chunk in prange((count + CHUNK - 1) // CHUNK):
-        A, P = np.empty((9, lanes)), np.empty((9, lanes))
-        K = np.empty((width, 3, width, 3))
-        for c in range(chunk * CHUNK, min(count, (chunk + 1) * CHUNK)):
-            stiffness(gradients[c], left[c], right[c], tangent[c], A, P, K)
-            for k in range(width):
-                for l in range(width):
-                    for i in range(3):
-                        for j in range(3):
-                            high = K[k, i, l, j] if k >= l else K[l, j, k, i]
-                            out[c, k, l, i, j] = high
+    width, lanes = gradients.shape[1], tangent.shape[2]
+    A, P = np.empty((9, lanes)), np.empty((9, lanes))
+    K = np.empty((width, 3, width, 3))
+    for c in range(begin, end):
+        stiffness(gradients[c], left[c], right[c], tangent[c], A, P, K)
+        for k in range(width):
+            for l in range(width):
+                for i in range(3):
+                    for j in range(3):
+                        high = K[k, i, l, j] if k >= l else K[l, j, k, i]
+                        out[c, k, l, i, j] = high
 
 
 @njit(**REDUCE)

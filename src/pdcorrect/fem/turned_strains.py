@@ -41,10 +41,10 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
+from pdcorrect.fem.cell_loops import CHUNK, CellLoop
 from pdcorrect.fem.decomposition import OPTIONS, scratch, signed_svd_lanes
-from pdcorrect.fem.kernels import CHUNK, PARALLEL
 
 _ROOT = np.sqrt(0.5)
 _ROWS = np.array([0, 1, 2, 1, 2, 0])
@@ -289,120 +289,96 @@ def _stress(K, z, factor, out):  # type: ignore[no-untyped-def]
             out[n] += K[m, n] * share
 
 
-@njit(**PARALLEL)
-def energy_and_forces(u, cells, shapes, sizes, matrices, shift, energy, by_cell):  # type: ignore[no-untyped-def]
+@CellLoop
+def energy_and_forces(  # type: ignore[no-untyped-def]
+    begin, end, u, cells, shapes, sizes, matrices, shift, energy, by_cell
+):
     """1/2 z . K z - shift . z of each cell, (C,), and its forces -d/du, (C, 8, 3).
 
     For displacements u (N, 3), m; shapes (C, 7, 8), a b_k and g_mk; sizes (C,), a, m; matrices
     (C, 18, 18), K, N/m; shift (C, 18), N, or empty.
     """
-    count = cells.shape[0]
-    for chunk in prange((count + CHUNK - 1) // CHUNK):
-        here = slice(chunk * CHUNK, min(count, (chunk + 1) * CHUNK))
-        _energy_and_forces(
-            u, cells[here], shapes[here], sizes[here], matrices[here], shift[here], energy[here],
-            by_cell[here],
-        )  # fmt: skip
-
-
-# What a thread does of its cells is a function of its own: numba makes loops for threads of
-# expressions on arrays beside a prange, and those on a `Cell` go wrong.
-
-
-@njit(**OPTIONS)
-def _energy_and_forces(u, cells, shapes, sizes, matrices, shift, energy, by_cell):  # type: ignore[no-untyped-def]
-    v, U, s, V = _frames(u, cells, shapes, sizes)
     cell, out = _cell(np.float64), np.empty((7, 3))
-    for c in range(len(cells)):
-        cell.v[:] = v[c]
-        _polar(U, s, V, c, sizes[c], cell)
-        measures = _strains(cell, sizes[c])
-        fades = measures[0] * measures[2]
-        _stress(matrices[c], cell.z, fades, cell.y)
-        total = 0.0
-        for n in range(18):
-            less = shift[c, n] if len(shift) else 0.0
-            total += fades * cell.z[n] * (0.5 * cell.y[n] - less)
-            cell.y[n] -= less
-        energy[c] = total
-        _pull(cell, measures, out)
-        _spread(out, shapes[c], -1.0, by_cell[c])
+    for low in range(begin, end, CHUNK):
+        high = min(end, low + CHUNK)
+        v, U, s, V = _frames(u, cells[low:high], shapes[low:high], sizes[low:high])
+        for c in range(low, high):
+            cell.v[:] = v[c - low]
+            _polar(U, s, V, c - low, sizes[c], cell)
+            measures = _strains(cell, sizes[c])
+            fades = measures[0] * measures[2]
+            _stress(matrices[c], cell.z, fades, cell.y)
+            total = 0.0
+            for n in range(18):
+                less = shift[c, n] if len(shift) else 0.0
+                total += fades * cell.z[n] * (0.5 * cell.y[n] - less)
+                cell.y[n] -= less
+            energy[c] = total
+            _pull(cell, measures, out)
+            _spread(out, shapes[c], -1.0, by_cell[c])
 
 
-@njit(**PARALLEL)
-def strains(u, cells, shapes, sizes, out):  # type: ignore[no-untyped-def]
+@CellLoop
+def strains(begin, end, u, cells, shapes, sizes, out):  # type: ignore[no-untyped-def]
     """Z of each cell, out (C, 18), m."""
-    count = cells.shape[0]
-    for chunk in prange((count + CHUNK - 1) // CHUNK):
-        here = slice(chunk * CHUNK, min(count, (chunk + 1) * CHUNK))
-        _cell_strains(u, cells[here], shapes[here], sizes[here], out[here])
-
-
-@njit(**OPTIONS)
-def _cell_strains(u, cells, shapes, sizes, out):  # type: ignore[no-untyped-def]
-    v, U, s, V = _frames(u, cells, shapes, sizes)
     cell = _cell(np.float64)
-    for c in range(len(cells)):
-        cell.v[:] = v[c]
-        _polar(U, s, V, c, sizes[c], cell)
-        measures = _strains(cell, sizes[c])
-        out[c] = measures[0] * measures[2] * cell.z
+    for low in range(begin, end, CHUNK):
+        high = min(end, low + CHUNK)
+        v, U, s, V = _frames(u, cells[low:high], shapes[low:high], sizes[low:high])
+        for c in range(low, high):
+            cell.v[:] = v[c - low]
+            _polar(U, s, V, c - low, sizes[c], cell)
+            measures = _strains(cell, sizes[c])
+            out[c] = measures[0] * measures[2] * cell.z
 
 
-@njit(**PARALLEL)
-def tangents(u, cells, shapes, sizes, matrices, shift, project, out):  # type: ignore[no-untyped-def]
+@CellLoop
+def tangents(  # type: ignore[no-untyped-def]
+    begin, end, u, cells, shapes, sizes, matrices, shift, project, out
+):
     """Second derivatives of the same by the amplitudes v (7, 3) of the shapes, (C, 21, 21), N/m.
 
     ``project`` leaves out what makes them indefinite where K is not.
     """
-    count = cells.shape[0]
-    for chunk in prange((count + CHUNK - 1) // CHUNK):
-        here = slice(chunk * CHUNK, min(count, (chunk + 1) * CHUNK))
-        _tangents(
-            u, cells[here], shapes[here], sizes[here], matrices[here], shift[here], project,
-            out[here],
-        )  # fmt: skip
-
-
-@njit(**OPTIONS)
-def _tangents(u, cells, shapes, sizes, matrices, shift, project, out):  # type: ignore[no-untyped-def]
-    v, U, s, V = _frames(u, cells, shapes, sizes)
     cell, moved = _cell(np.float64), _cell(np.complex128)
     column, change = np.empty((7, 3)), np.empty((7, 3), np.complex128)
     y, dz, dy, D, turn = np.empty(18), np.empty(18), np.empty(18), np.empty((3, 3)), np.empty(3)
-    for c in range(len(cells)):
-        cell.v[:] = v[c]
-        _polar(U, s, V, c, sizes[c], cell)
-        measures = _strains(cell, sizes[c])
-        _stress(matrices[c], cell.z, measures[0] * measures[2], y)
-        if len(shift):
-            y -= shift[c]
-        for a in range(7):
-            for i in range(3):
-                _move(cell, a, i, moved, D, turn)
-                after = _strains(moved, sizes[c])
-                fades = after[0] * after[2]
-                for n in range(18):
-                    dz[n] = (fades * moved.z[n]).imag / _STEP
-                _stress(matrices[c], dz, 1.0, dy)
-                if project:
-                    cell.y[:] = dy
-                    _pull(cell, measures, column)
-                else:
+    for low in range(begin, end, CHUNK):
+        high = min(end, low + CHUNK)
+        v, U, s, V = _frames(u, cells[low:high], shapes[low:high], sizes[low:high])
+        for c in range(low, high):
+            cell.v[:] = v[c - low]
+            _polar(U, s, V, c - low, sizes[c], cell)
+            measures = _strains(cell, sizes[c])
+            _stress(matrices[c], cell.z, measures[0] * measures[2], y)
+            if len(shift):
+                y -= shift[c]
+            for a in range(7):
+                for i in range(3):
+                    _move(cell, a, i, moved, D, turn)
+                    after = _strains(moved, sizes[c])
+                    fades = after[0] * after[2]
                     for n in range(18):
-                        moved.y[n] = complex(y[n], _STEP * dy[n])
-                    _pull(moved, after, change)
-                for b in range(7):
-                    for j in range(3):
-                        value = column[b, j] if project else change[b, j].imag / _STEP
-                        out[c, 3 * b + j, 3 * a + i] = value
+                        dz[n] = (fades * moved.z[n]).imag / _STEP
+                    _stress(matrices[c], dz, 1.0, dy)
+                    if project:
+                        cell.y[:] = dy
+                        _pull(cell, measures, column)
+                    else:
+                        for n in range(18):
+                            moved.y[n] = complex(y[n], _STEP * dy[n])
+                        _pull(moved, after, change)
+                    for b in range(7):
+                        for j in range(3):
+                            value = column[b, j] if project else change[b, j].imag / _STEP
+                            out[c, 3 * b + j, 3 * a + i] = value
 
 
-@njit(**PARALLEL)
-def add_blocks(tangent, shapes, blocks):  # type: ignore[no-untyped-def]
+@CellLoop
+def add_blocks(begin, end, tangent, shapes, blocks):  # type: ignore[no-untyped-def]
     """Add the tangents (C, 21, 21) to cells' matrices (C, L, L, 3, 3) of nodes."""
-    for c in prange(len(shapes)):
-        half = np.empty((7, 3, 8, 3))
+    half = np.empty((7, 3, 8, 3))
+    for c in range(begin, end):
         for a in range(7):
             for i in range(3):
                 for k in range(8):
@@ -421,13 +397,13 @@ def add_blocks(tangent, shapes, blocks):  # type: ignore[no-untyped-def]
                         blocks[c, l, k, i, j] += total
 
 
-@njit(**PARALLEL)
-def apply_tangents(x, cells, shapes, tangent, by_cell):  # type: ignore[no-untyped-def]
+@CellLoop
+def apply_tangents(begin, end, x, cells, shapes, tangent, by_cell):  # type: ignore[no-untyped-def]
     """The tangents times x (N, 3), by cell, (C, 8, 3)."""
-    for c in prange(cells.shape[0]):
-        dv, out = np.empty((7, 3)), np.empty((7, 3))
+    dv, out = np.empty((7, 3)), np.empty((7, 3))
+    flat, to = dv.reshape(21), out.reshape(21)
+    for c in range(begin, end):
         _amplitudes(x, cells[c], shapes[c], dv)
-        flat, to = dv.reshape(21), out.reshape(21)
         for n in range(21):
             total = 0.0
             for m in range(21):

@@ -20,16 +20,14 @@ a division of A_ij by s_i + s_j),
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 from numpy.typing import NDArray
 
+from pdcorrect.fem.cell_loops import CellLoop
 from pdcorrect.fem.decomposition import OPTIONS, signed_svd_lanes
 from pdcorrect.fem.elastic_body import ElasticBody
 from pdcorrect.fem.kernels import (
-    CHUNK,
-    PARALLEL,
     deformation,
-    gather_nodes,
     nodal_forces,
     transform,
     unit_change,
@@ -73,7 +71,7 @@ class Stretches:
         self._left, self._right = np.empty((count, 9, lanes)), np.empty((count, 9, lanes))
         self._values, self.tensor = np.empty((count, 3, lanes)), np.empty((count, 9, lanes))
         _decompose(
-            u, body.space.local, body.quadrature.lanes,
+            count, u, body.space.local, body.quadrature.lanes,
             self._left, self._right, self._values, self.tensor,
         )  # fmt: skip
 
@@ -81,14 +79,14 @@ class Stretches:
         """DS (C, 9, Q) for a change x (N + B, 3) of the configuration."""
         out = np.empty_like(self.tensor)
         cells, gradients = self.body.space.local, self.body.quadrature.lanes
-        _rates(x, cells, gradients, *self._frames, out)
+        _rates(len(out), x, cells, gradients, *self._frames, out)
         return out
 
     def forces(self, A: Array) -> Array:
         """Derivatives (N + B, 3) of A : S by the configuration, for A (C, 9, Q)."""
         by_cell = np.empty((*self.body.space.local.shape, 3))
-        _pull(self.body.quadrature.lanes, *self._frames, A, by_cell)
-        return self._gathered(by_cell)
+        _pull(len(A), self.body.quadrature.lanes, *self._frames, A, by_cell)
+        return self.body.assembly.gathered(by_cell)
 
     def apply(self, A: Array, rate: float, x: Array, project: bool = False) -> Array:
         """Change (N + B, 3) of `forces` of A = rate C : (S - S'), by x (N + B, 3).
@@ -98,41 +96,39 @@ class Stretches:
         body = self.body
         by_cell = np.empty((*body.space.local.shape, 3))
         _apply(
-            x, body.space.local, body.quadrature.lanes, *self._frames, body.point_weights, A,
-            rate, project, by_cell,
+            len(A), x, body.space.local, body.quadrature.lanes, *self._frames, body.point_weights,
+            A, rate, project, by_cell,
         )  # fmt: skip
-        return self._gathered(by_cell)
+        return self.body.assembly.gathered(by_cell)
 
     def blocks(self, A: Array, rate: float, project: bool = False) -> Array:
         """The same as matrices of the cells, (C, L, L, 3, 3)."""
         body = self.body
         count, width = body.space.local.shape
         out = np.empty((count, width, width, 3, 3))
-        _blocks(body.quadrature.lanes, *self._frames, body.point_weights, A, rate, project, out)
+        _blocks(
+            count, body.quadrature.lanes, *self._frames, body.point_weights, A, rate, project, out
+        )
         return out
 
     @property
     def _frames(self) -> tuple[Array, Array, Array]:
         return self._left, self._right, self._values
 
-    def _gathered(self, by_cell: Array) -> Array:
-        assembly, out = self.body.assembly, np.empty((self.body.unknowns, 3))
-        gather_nodes(assembly.start, assembly.slots, by_cell.reshape(-1, 3), out)
-        return out
 
-
-@njit(**PARALLEL)
-def _decompose(u, cells, gradients, left, right, values, tensor):  # type: ignore[no-untyped-def]
-    count, lanes = cells.shape[0], gradients.shape[3]
-    for chunk in prange((count + CHUNK - 1) // CHUNK):
-        F, B, W = np.empty((9, lanes)), np.empty((9, lanes)), np.empty((6, lanes))
-        diagonal = np.zeros((9, lanes))
-        for c in range(chunk * CHUNK, min(count, (chunk + 1) * CHUNK)):
-            deformation(u, cells[c], gradients[c], 1.0, F)
-            signed_svd_lanes(F, left[c], values[c], right[c], B, W)
-            for i in range(3):
-                diagonal[4 * i] = values[c, i]
-            transform(right[c], diagonal, right[c], tensor[c], False)
+@CellLoop
+def _decompose(  # type: ignore[no-untyped-def]
+    begin, end, u, cells, gradients, left, right, values, tensor
+):
+    lanes = gradients.shape[3]
+    F, B, W = np.empty((9, lanes)), np.empty((9, lanes)), np.empty((6, lanes))
+    diagonal = np.zeros((9, lanes))
+    for c in range(begin, end):
+        deformation(u, cells[c], gradients[c], 1.0, F)
+        signed_svd_lanes(F, left[c], values[c], right[c], B, W)
+        for i in range(3):
+            diagonal[4 * i] = values[c, i]
+        transform(right[c], diagonal, right[c], tensor[c], False)
 
 
 @njit(**OPTIONS)
@@ -187,65 +183,65 @@ def _change(s, Z, B, weights, rate, project, dS, dA, P):  # type: ignore[no-unty
                         P[3 * i + j, q] += 2.0 * B[3 * i + k, q] * Z[3 * k + j, q]
 
 
-@njit(**PARALLEL)
-def _rates(x, cells, gradients, left, right, values, out):  # type: ignore[no-untyped-def]
-    count, lanes = cells.shape[0], gradients.shape[3]
-    for chunk in prange((count + CHUNK - 1) // CHUNK):
-        D, B, dS = np.empty((9, lanes)), np.empty((9, lanes)), np.empty((9, lanes))
-        for c in range(chunk * CHUNK, min(count, (chunk + 1) * CHUNK)):
-            deformation(x, cells[c], gradients[c], 0.0, D)
-            transform(left[c], D, right[c], B, True)
-            _stretching(values[c], B, dS)
-            transform(right[c], dS, right[c], out[c], False)
+@CellLoop
+def _rates(begin, end, x, cells, gradients, left, right, values, out):  # type: ignore[no-untyped-def]
+    lanes = gradients.shape[3]
+    D, B, dS = np.empty((9, lanes)), np.empty((9, lanes)), np.empty((9, lanes))
+    for c in range(begin, end):
+        deformation(x, cells[c], gradients[c], 0.0, D)
+        transform(left[c], D, right[c], B, True)
+        _stretching(values[c], B, dS)
+        transform(right[c], dS, right[c], out[c], False)
 
 
-@njit(**PARALLEL)
-def _pull(gradients, left, right, values, A, by_cell):  # type: ignore[no-untyped-def]
-    count, lanes = gradients.shape[0], gradients.shape[3]
-    for chunk in prange((count + CHUNK - 1) // CHUNK):
-        T, Z = np.empty((9, lanes)), np.empty((9, lanes))
-        for c in range(chunk * CHUNK, min(count, (chunk + 1) * CHUNK)):
-            transform(right[c], A[c], right[c], T, True)
-            _divided(values[c], T, Z)
-            for i in range(9):
-                for q in range(lanes):
-                    Z[i, q] *= 2.0 * values[c, i // 3, q]
-            transform(left[c], Z, right[c], T, False)
-            nodal_forces(T, gradients[c], 1.0, by_cell[c])
+@CellLoop
+def _pull(begin, end, gradients, left, right, values, A, by_cell):  # type: ignore[no-untyped-def]
+    lanes = gradients.shape[3]
+    T, Z = np.empty((9, lanes)), np.empty((9, lanes))
+    for c in range(begin, end):
+        transform(right[c], A[c], right[c], T, True)
+        _divided(values[c], T, Z)
+        for i in range(9):
+            for q in range(lanes):
+                Z[i, q] *= 2.0 * values[c, i // 3, q]
+        transform(left[c], Z, right[c], T, False)
+        nodal_forces(T, gradients[c], 1.0, by_cell[c])
 
 
-@njit(**PARALLEL)
-def _apply(x, cells, gradients, left, right, values, weights, A, rate, project, by_cell):  # type: ignore[no-untyped-def]
-    count, lanes = cells.shape[0], gradients.shape[3]
-    for chunk in prange((count + CHUNK - 1) // CHUNK):
-        D, B, Z = np.empty((9, lanes)), np.empty((9, lanes)), np.empty((9, lanes))
-        P, dS, dA = np.empty((9, lanes)), np.empty((9, lanes)), np.empty((9, lanes))
-        for c in range(chunk * CHUNK, min(count, (chunk + 1) * CHUNK)):
-            transform(right[c], A[c], right[c], D, True)
-            _divided(values[c], D, Z)
-            deformation(x, cells[c], gradients[c], 0.0, D)
-            transform(left[c], D, right[c], B, True)
-            _change(values[c], Z, B, weights[c], rate, project, dS, dA, P)
-            transform(left[c], P, right[c], D, False)
-            nodal_forces(D, gradients[c], 1.0, by_cell[c])
+@CellLoop
+def _apply(  # type: ignore[no-untyped-def]
+    begin, end, x, cells, gradients, left, right, values, weights, A, rate, project, by_cell
+):
+    lanes = gradients.shape[3]
+    D, B, Z = np.empty((9, lanes)), np.empty((9, lanes)), np.empty((9, lanes))
+    P, dS, dA = np.empty((9, lanes)), np.empty((9, lanes)), np.empty((9, lanes))
+    for c in range(begin, end):
+        transform(right[c], A[c], right[c], D, True)
+        _divided(values[c], D, Z)
+        deformation(x, cells[c], gradients[c], 0.0, D)
+        transform(left[c], D, right[c], B, True)
+        _change(values[c], Z, B, weights[c], rate, project, dS, dA, P)
+        transform(left[c], P, right[c], D, False)
+        nodal_forces(D, gradients[c], 1.0, by_cell[c])
 
 
-@njit(**PARALLEL)
-def _blocks(gradients, left, right, values, weights, A, rate, project, out):  # type: ignore[no-untyped-def]
-    count, width, lanes = gradients.shape[0], gradients.shape[1], gradients.shape[3]
-    for chunk in prange((count + CHUNK - 1) // CHUNK):
-        D, B, Z = np.empty((9, lanes)), np.empty((9, lanes)), np.empty((9, lanes))
-        P, dS, dA = np.empty((9, lanes)), np.empty((9, lanes)), np.empty((9, lanes))
-        column = np.empty((width, 3))
-        for c in range(chunk * CHUNK, min(count, (chunk + 1) * CHUNK)):
-            transform(right[c], A[c], right[c], D, True)
-            _divided(values[c], D, Z)
-            for k in range(width):
-                for i in range(3):
-                    unit_change(gradients[c, k], i, left[c], right[c], B)
-                    _change(values[c], Z, B, weights[c], rate, project, dS, dA, P)
-                    transform(left[c], P, right[c], D, False)
-                    nodal_forces(D, gradients[c], 1.0, column)
-                    for l in range(width):
-                        for j in range(3):
-                            out[c, l, k, j, i] = column[l, j]
+@CellLoop
+def _blocks(  # type: ignore[no-untyped-def]
+    begin, end, gradients, left, right, values, weights, A, rate, project, out
+):
+    width, lanes = gradients.shape[1], gradients.shape[3]
+    D, B, Z = np.empty((9, lanes)), np.empty((9, lanes)), np.empty((9, lanes))
+    P, dS, dA = np.empty((9, lanes)), np.empty((9, lanes)), np.empty((9, lanes))
+    column = np.empty((width, 3))
+    for c in range(begin, end):
+        transform(right[c], A[c], right[c], D, True)
+        _divided(values[c], D, Z)
+        for k in range(width):
+            for i in range(3):
+                unit_change(gradients[c, k], i, left[c], right[c], B)
+                _change(values[c], Z, B, weights[c], rate, project, dS, dA, P)
+                transform(left[c], P, right[c], D, False)
+                nodal_forces(D, gradients[c], 1.0, column)
+                for l in range(width):
+                    for j in range(3):
+                        out[c, l, k, j, i] = column[l, j]
