@@ -26,7 +26,7 @@ class CellLoop:
     """
 
     def __init__(self, function: Callable[..., None]) -> None:
-        self.kernel = njit(**OPTIONS)(function)
+        self.kernel = njit(**{**OPTIONS, "no_cfunc_wrapper": False})(function)
         self._addresses: dict[tuple[Any, ...], int] = {}
 
     def __call__(self, count: int, *arguments: Any) -> None:

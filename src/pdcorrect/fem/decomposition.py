@@ -45,6 +45,7 @@ def _kept() -> bool:
 
 OPTIONS: dict[str, Any] = {
     "cache": _kept(), "error_model": "numpy", "fastmath": {"contract", "nsz"},
+    "no_cfunc_wrapper": True,
 }  # fmt: skip
 """numba settings of all kernels: IEEE division, fused multiply-add allowed."""
 

@@ -159,8 +159,11 @@ def _eliminate(  # type: ignore[no-untyped-def]
             K[i, i] += shift * largest
         positive[c] = _factorise(K, 0.0)
         _substitute(K, right)
-        inverse[c] = right[:, :m]
-        solved[c] = right[:, m:]
+        for i in range(m):
+            for j in range(m):
+                inverse[c, i, j] = right[i, j]
+            for j in range(n):
+                solved[c, i, j] = right[i, m + j]
         for i in range(n):
             for j in range(n):
                 value = blocks[c, i // 3, j // 3, i % 3, j % 3]

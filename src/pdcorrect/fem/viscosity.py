@@ -127,7 +127,8 @@ def _decompose(  # type: ignore[no-untyped-def]
         deformation(u, cells[c], gradients[c], 1.0, F)
         signed_svd_lanes(F, left[c], values[c], right[c], B, W)
         for i in range(3):
-            diagonal[4 * i] = values[c, i]
+            for q in range(lanes):
+                diagonal[4 * i, q] = values[c, i, q]
         transform(right[c], diagonal, right[c], tensor[c], False)
 
 

@@ -382,7 +382,9 @@ def _palette(sample: Image) -> Any:
     """An image whose palette is white and 255 other colours."""
     pil = require_extra("PIL.Image", "view")
     # each colour once, to 8 levels, however often it is used: small things keep theirs
-    colours = np.unique(sample.reshape(-1, 3) & 0xF8, axis=0) | 4
+    levels = (sample.reshape(-1, 3) >> 3) @ np.array([1024, 32, 1])
+    used = np.flatnonzero(np.bincount(levels))
+    colours = np.stack([used >> 10, used >> 5 & 31, used & 31], axis=1).astype(np.uint8) << 3 | 4
     chosen = pil.fromarray(colours[None]).quantize(255, kmeans=3).getpalette()[: 3 * 255]
     palette = pil.new("P", (1, 1))
     palette.putpalette([255, 255, 255, *chosen])
