@@ -20,6 +20,7 @@ from pdcorrect.errors import ConvergenceError, InputError
 from pdcorrect.fem import internal_modes, kernels
 from pdcorrect.fem.assembly import Assembly, summed_cells
 from pdcorrect.fem.cell_correction import CellCorrection, CorrectionTangent
+from pdcorrect.fem.energies import nearest_rotation
 from pdcorrect.fem.hexahedron import corner_jacobians
 from pdcorrect.fem.internal_modes import Condensed
 from pdcorrect.fem.materials import Materials
@@ -33,6 +34,8 @@ _RELAXED = 1e-13
 """Of the cell size: change of an internal mode at which its equilibrium is found."""
 _FLAT = 1e-6
 """The same where only the energy is asked for, from modes that are near."""
+_LARGEST = 1e50
+"""Deformation gradients are cut off here, so that their squares' squares are finite."""
 _NEAR = 1e-4
 """Of the cell size: change below which `internal_modes.relax` uses the exact tangent."""
 
@@ -161,6 +164,40 @@ class ElasticBody:
         )  # fmt: skip
         x[: len(positions)] = positions
         return x
+
+    def following(self, positions: Array) -> Array:
+        """The configuration (N + B, 3) whose modes follow as at rest, turned with their cells.
+
+        Near equilibrium, for the price of a rotation of each cell: where solvers begin.
+        """
+        self._check(positions, len(self.positions))
+        if not self.space.internal:
+            return positions
+        out = self.extended(positions)
+        turns = self.cell_rotations(positions)
+        self._at_rest.follow(np.ascontiguousarray(turns), self.positions, out)
+        return out
+
+    def cell_rotations(self, positions: Array) -> Array:
+        """Nearest rotation of each cell's mean deformation gradient, (C, 3, 3).
+
+        Those of absurd or infinite deformations mean nothing: such a step fails by name.
+        """
+        u = positions[: len(self.positions)] - self.positions
+        mean = np.einsum("cki,ckj->cij", u[self.cells], self._mean_gradients, optimize=True)
+        return nearest_rotation(np.eye(3) + np.clip(np.nan_to_num(mean), -_LARGEST, _LARGEST))
+
+    @cached_property
+    def _mean_gradients(self) -> Array:
+        """Means of the nodal shape functions' gradients over the cells, (C, K, 3), 1/m."""
+        shares = self.quadrature.weights / self.space.volumes()[:, None]
+        lanes = self.quadrature.lanes[:, : self.cells.shape[1]]
+        return np.einsum("cq,clxq->clx", shares, lanes, optimize=True)
+
+    @cached_property
+    def _at_rest(self) -> Condensed:
+        """The tangent at rest."""
+        return self.condensed(self.extended(self.positions))
 
     def energy(self, positions: Array, modes: Array | None = None) -> float:
         """Elastic energy, J, with internal modes in equilibrium.

@@ -6,7 +6,6 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from pdcorrect.fem.assembly import scatter
 from pdcorrect.fem.cell_loops import CellLoop
 from pdcorrect.fem.decomposition import OPTIONS, scratch, signed_svd_lanes
 from pdcorrect.fem.energies import principal_stress_lanes, principal_tangent_lanes, stress_lanes
@@ -172,6 +171,54 @@ def _eliminate(  # type: ignore[no-untyped-def]
                 condensed[c, i // 3, j // 3, i % 3, j % 3] = value
 
 
+@njit(**OPTIONS)
+def _reduce(solved, nodes, modes, r, out):  # type: ignore[no-untyped-def]
+    """Subtract (K_bb^-1 K_bu)^T times the modes' part of r (N + B, 3) from out (N, 3)."""
+    for c in range(len(nodes)):
+        for b in range(solved.shape[1]):
+            value = r[modes[c, b // 3], b % 3]
+            for k in range(nodes.shape[1]):
+                for j in range(3):
+                    out[nodes[c, k], j] -= solved[c, b, 3 * k + j] * value
+
+
+@njit(**OPTIONS)
+def _recover(inverse, solved, nodes, modes, r, out):  # type: ignore[no-untyped-def]
+    """Modes of out (N + B, 3): K_bb^-1 times those of r less K_bb^-1 K_bu times its nodes."""
+    for c in range(len(nodes)):
+        for b in range(solved.shape[1]):
+            total = 0.0
+            for a in range(solved.shape[1]):
+                total += inverse[c, b, a] * r[modes[c, a // 3], a % 3]
+            for k in range(nodes.shape[1]):
+                for j in range(3):
+                    total -= solved[c, b, 3 * k + j] * out[nodes[c, k], j]
+            out[modes[c, b // 3], b % 3] = total
+
+
+@njit(**OPTIONS)
+def _follow(solved, turns, rest, nodes, modes, out):  # type: ignore[no-untyped-def]
+    """Modes of out (N + B, 3): R times -K_bb^-1 K_bu times R^T times its nodes less the rest's."""
+    width = nodes.shape[1]
+    moved, amplitude = np.empty(3 * width), np.empty(3)
+    for c in range(len(nodes)):
+        R = turns[c]
+        for k in range(width):
+            x = out[nodes[c, k]]
+            for j in range(3):
+                turned = R[0, j] * x[0] + R[1, j] * x[1] + R[2, j] * x[2]
+                moved[3 * k + j] = turned - rest[nodes[c, k], j]
+        for m in range(modes.shape[1]):
+            for i in range(3):
+                total = 0.0
+                for n in range(3 * width):
+                    total -= solved[c, 3 * m + i, n] * moved[n]
+                amplitude[i] = total
+            for i in range(3):
+                value = R[i, 0] * amplitude[0] + R[i, 1] * amplitude[1] + R[i, 2] * amplitude[2]
+                out[modes[c, m], i] = value
+
+
 class Condensed:
     """Tangents (C, L, L, 3, 3) of nodes and modes, with the modes eliminated.
 
@@ -208,26 +255,29 @@ class Condensed:
         """Right-hand side (N, 3) of the nodes for that of a configuration, (N + B, 3)."""
         if not self.size:
             return r
-        count = len(r) - self.size
-        modes = r[self._modes].reshape(len(self._modes), -1, 1)
-        moved = (self._solved.transpose(0, 2, 1) @ modes).reshape(*self._nodes.shape, 3)
-        return r[:count] - scatter(self._nodes, moved, count)
+        out = r[: len(r) - self.size].copy()
+        _reduce(self._solved, self._nodes, self._modes, r, out)
+        return out
 
     def recovered(self, nodal: Array, r: Array) -> Array:
         """The whole solution (N + B, 3) for that of the nodes (N, 3) and right-hand side r."""
         if not self.size:
             return nodal
-        modes = r[self._modes].reshape(len(self._modes), -1, 1)
-        values = nodal[self._nodes].reshape(len(self._nodes), -1, 1)
-        found = self._inverse @ modes - self._solved @ values
         out = np.empty_like(r)
         out[: len(nodal)] = nodal
-        out[self._modes] = found.reshape(*self._modes.shape, 3)
+        _recover(self._inverse, self._solved, self._nodes, self._modes, r, out)
         return out
 
     def lifted(self, nodal: Array) -> Array:
         """The configuration's change (N + B, 3) for a change of the nodes (N, 3)."""
         return self.recovered(nodal, np.zeros((len(nodal) + self.size, 3)))
+
+    def follow(self, turns: Array, rest: Array, out: Array) -> None:
+        """Set the modes of ``out`` (N + B, 3) by its nodes, in cells turned by ``turns`` (C, 3, 3).
+
+        ``rest`` (N, 3) are positions at which they are zero.
+        """
+        _follow(self._solved, turns, rest, self._nodes, self._modes, out)
 
     def response(self, r: Array) -> Array:
         """The modes' change (N + B, 3) with nodes held, by forces r (N + B, 3)."""

@@ -25,23 +25,16 @@ Array = NDArray[np.float64]
 
 INSIDE = -1
 """Age of a Hessian that was factorised within a step, at no frame."""
-_LARGEST = 1e50
-"""Deformation gradients are cut off here, so that their squares' squares are finite."""
 _MODE_STEPS = 2
 """Newton steps of each cell's internal modes before its Hessian is taken."""
 
 
 class Rotations:
-    """How the parts of a body have turned: rotations of cells and nodes."""
+    """How the nodes of a body have turned."""
 
     def __init__(self, problem: Problem) -> None:
         self._problem = problem
         cells, count = problem.cells, len(problem.positions)
-        weights = problem.space.volumes()[:, None]
-        quadrature = problem.quadrature
-        shares = quadrature.weights / weights
-        lanes = quadrature.lanes[:, : cells.shape[1]]
-        self._mean = np.einsum("cq,clxq->clx", shares, lanes, optimize=True)
         owners = np.repeat(np.arange(len(cells)), cells.shape[1])
         ones = np.ones(cells.size)
         self._gather = sp.csr_matrix((ones, (cells.ravel(), owners)), shape=(count, len(cells)))
@@ -49,21 +42,12 @@ class Rotations:
         if problem.rollers is not None:
             self._held[problem.rollers.nodes] = True
 
-    def of_cells(self, y: Array) -> Array:
-        """Nearest rotation of each cell's mean deformation gradient, (C, 3, 3).
-
-        Those of absurd or infinite deformations mean nothing: such a step fails by name.
-        """
-        u = y[: len(self._problem.positions)] - self._problem.positions
-        mean = np.einsum("cki,ckj->cij", u[self._problem.cells], self._mean, optimize=True)
-        return nearest_rotation(np.eye(3) + np.clip(np.nan_to_num(mean), -_LARGEST, _LARGEST))
-
     def since(self, before: Array, y: Array) -> Array:
         """Rotations (N + B, 3, 3) of nodes and modes from cells' ``before`` (C, 3, 3) to y.
 
         A node turns as its cells do on average; one with a clamped component does not.
         """
-        turns = self.of_cells(y) @ np.swapaxes(before, -1, -2)
+        turns = self._problem.cell_rotations(y) @ np.swapaxes(before, -1, -2)
         total = (self._gather @ turns.reshape(-1, 9)).reshape(-1, 3, 3)
         nodes = nearest_rotation(total)
         nodes[self._held] = np.eye(3)
@@ -175,7 +159,7 @@ class TrueHessian:
         at_rest = age != INSIDE and not self.lagged
         self._solver = None  # two factors at a time would be the peak of memory
         self._solver = self.tangents.first_hessian(objective, y, at_rest)
-        self._shape = self._rotations.of_cells(y)
+        self._shape = self._problem.cell_rotations(y)
         self._factors, self.age, self._counts = objective.factors, age, []
         return self._solver
 

@@ -35,9 +35,6 @@ from pdcorrect.state import State
 
 Array = NDArray[np.float64]
 
-_MODE_STEPS = 1
-"""Newton steps of each cell's internal modes before the first iterate."""
-
 
 class StepObjective:
     """gamma for one step from ``state``, over configurations y (N + B, 3).
@@ -67,7 +64,7 @@ class StepObjective:
         self.stage = stage
         self.free = problem.free_unknowns
         self.scale = 0.0
-        self.start = problem.relaxed(stage.start, steps=_MODE_STEPS)
+        self.start = problem.following(stage.start)
         self._extra = extra
         self.forces = self._forces(stage.start)
         self.factors = hessian_factors(problem, stage)
@@ -82,7 +79,7 @@ class StepObjective:
         if problem.contact is not None:
             self.contact = ContactTerm(problem.contact, stage, state)
             start = self.contact.feasible(stage.start, problem.free)
-            self.start = problem.relaxed(start, steps=_MODE_STEPS)
+            self.start = problem.following(start)
 
     @property
     def follows(self) -> bool:
