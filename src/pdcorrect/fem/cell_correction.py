@@ -96,11 +96,7 @@ class CellCorrection:
         semi-definite near rest.
         """
         part = self if cells == slice(None) else self.of_cells(cells)
-        out = np.empty((len(part.cells), 21, 21))
-        turned_strains.tangents(
-            len(out), u, part.cells, part.shapes, part.sizes, part.matrices, shift, project, out
-        )
-        return CorrectionTangent(part, out)
+        return CorrectionTangent(part, u, project, shift)
 
     def stress(self, z: Array) -> Array:
         """K z, (C, 18), N, for strains (C, 18)."""
@@ -207,22 +203,33 @@ def _symmetric_products(a: Array, b: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class CorrectionTangent:
-    """The second derivative of a correction's energy at one configuration.
-
-    ``matrices`` (C, 21, 21), N/m, are by the amplitudes of the cells' shapes.
-    """
+    """The second derivative of a correction's energy at displacements ``u`` (N or more, 3), m."""
 
     correction: CellCorrection
-    matrices: Array
+    u: Array
+    project: bool
+    shift: Array
 
     def apply(self, x: Array) -> Array:
-        """Times x (N or more, 3)."""
+        """Times x (N or more, 3), without the matrices."""
         correction = self.correction
         by_cell = np.empty((*correction.cells.shape, 3))
-        turned_strains.apply_tangents(
-            len(by_cell), x, correction.cells, correction.shapes, self.matrices, by_cell
-        )
+        turned_strains.products(
+            len(by_cell), x, self.u, correction.cells, correction.shapes, correction.sizes,
+            correction.matrices, self.shift, self.project, by_cell,
+        )  # fmt: skip
         return correction._gathered(x, by_cell)
+
+    @cached_property
+    def matrices(self) -> Array:
+        """(C, 21, 21), N/m, by the amplitudes of the cells' shapes."""
+        correction = self.correction
+        out = np.empty((len(correction.cells), 21, 21))
+        turned_strains.tangents(
+            len(out), self.u, correction.cells, correction.shapes, correction.sizes,
+            correction.matrices, self.shift, self.project, out,
+        )  # fmt: skip
+        return out
 
     def add_to(self, blocks: Array) -> None:
         """Add the cells' matrices to blocks (C, L, L, 3, 3) of nodes, N/m."""

@@ -247,17 +247,18 @@ def _pull(cell, measures, out):  # type: ignore[no-untyped-def]
 
 
 @njit(**OPTIONS)
-def _move(cell, a, i, moved, D, turn):  # type: ignore[no-untyped-def]
-    """The cell after an imaginary step of amplitude (a, i), its z to be made; D (3, 3), turn (3,)
-    are room.
+def _move(cell, dv, moved, D, turn):  # type: ignore[no-untyped-def]
+    """The cell after an imaginary step of amplitudes dv (7, 3), its z to be made; D (3, 3), turn
+    (3,) are room.
     """
-    moved.v[:], moved.R[:], moved.S[:], moved.Y[:] = cell.v, cell.R, cell.S, cell.Y
-    moved.v[a, i] += 1j * _STEP
-    if a > 2:
-        return
+    moved.R[:], moved.S[:], moved.Y[:] = cell.R, cell.S, cell.Y
+    for a in range(7):
+        for i in range(3):
+            moved.v[a, i] = complex(cell.v[a, i], _STEP * dv[a, i])
     R, S, Y = cell.R, cell.S, cell.Y
-    D[:] = 0.0
-    D[:, a] = R[i]
+    for a in range(3):
+        for j in range(3):
+            D[j, a] = R[0, j] * dv[a, 0] + R[1, j] * dv[a, 1] + R[2, j] * dv[a, 2]
     _axial(D, -1.0, cell.t)
     _times(Y, cell.t, turn)
     for j in range(3):
@@ -332,6 +333,47 @@ def strains(begin, end, u, cells, shapes, sizes, out):  # type: ignore[no-untype
             out[c] = measures[0] * measures[2] * cell.z
 
 
+@njit(**OPTIONS)
+def _change(cell, dv, size, K, y, measures, project, moved, room, out):  # type: ignore[no-untyped-def]
+    """Out (7, 3): how amplitudes dv (7, 3) change the derivatives by v; y (18,) are those by z."""
+    change, dz, dy, D, turn = room
+    _move(cell, dv, moved, D, turn)
+    after = _strains(moved, size)
+    fades = after[0] * after[2]
+    for n in range(18):
+        dz[n] = (fades * moved.z[n]).imag / _STEP
+    _stress(K, dz, 1.0, dy)
+    if project:
+        cell.y[:] = dy
+        _pull(cell, measures, out)
+        return
+    for n in range(18):
+        moved.y[n] = complex(y[n], _STEP * dy[n])
+    _pull(moved, after, change)
+    for a in range(7):
+        for i in range(3):
+            out[a, i] = change[a, i].imag / _STEP
+
+
+@njit(**OPTIONS)
+def _room():  # type: ignore[no-untyped-def]
+    """For `_change`."""
+    change = np.empty((7, 3), np.complex128)
+    return change, np.empty(18), np.empty(18), np.empty((3, 3)), np.empty(3)
+
+
+@njit(**OPTIONS)
+def _linearise(v, U, s, V, l, size, K, shift, cell, y):  # type: ignore[no-untyped-def]
+    """Make the cell of lane l and its y (18,), K z less ``shift``; its measures."""
+    cell.v[:] = v[l]
+    _polar(U, s, V, l, size, cell)
+    measures = _strains(cell, size)
+    _stress(K, cell.z, measures[0] * measures[2], y)
+    if len(shift):
+        y -= shift
+    return measures
+
+
 @CellLoop
 def tangents(  # type: ignore[no-untyped-def]
     begin, end, u, cells, shapes, sizes, matrices, shift, project, out
@@ -340,38 +382,40 @@ def tangents(  # type: ignore[no-untyped-def]
 
     ``project`` leaves out what makes them indefinite where K is not.
     """
-    cell, moved = _cell(np.float64), _cell(np.complex128)
-    column, change = np.empty((7, 3)), np.empty((7, 3), np.complex128)
-    y, dz, dy, D, turn = np.empty(18), np.empty(18), np.empty(18), np.empty((3, 3)), np.empty(3)
+    cell, moved, room = _cell(np.float64), _cell(np.complex128), _room()
+    column, unit, y = np.empty((7, 3)), np.zeros((7, 3)), np.empty(18)
     for low in range(begin, end, CHUNK):
         high = min(end, low + CHUNK)
         v, U, s, V = _frames(u, cells[low:high], shapes[low:high], sizes[low:high])
         for c in range(low, high):
-            cell.v[:] = v[c - low]
-            _polar(U, s, V, c - low, sizes[c], cell)
-            measures = _strains(cell, sizes[c])
-            _stress(matrices[c], cell.z, measures[0] * measures[2], y)
-            if len(shift):
-                y -= shift[c]
+            K, less, size = matrices[c], shift[c : c + 1].ravel(), sizes[c]
+            measures = _linearise(v, U, s, V, c - low, size, K, less, cell, y)
             for a in range(7):
                 for i in range(3):
-                    _move(cell, a, i, moved, D, turn)
-                    after = _strains(moved, sizes[c])
-                    fades = after[0] * after[2]
-                    for n in range(18):
-                        dz[n] = (fades * moved.z[n]).imag / _STEP
-                    _stress(matrices[c], dz, 1.0, dy)
-                    if project:
-                        cell.y[:] = dy
-                        _pull(cell, measures, column)
-                    else:
-                        for n in range(18):
-                            moved.y[n] = complex(y[n], _STEP * dy[n])
-                        _pull(moved, after, change)
+                    unit[a, i] = 1.0
+                    _change(cell, unit, size, K, y, measures, project, moved, room, column)
+                    unit[a, i] = 0.0
                     for b in range(7):
                         for j in range(3):
-                            value = column[b, j] if project else change[b, j].imag / _STEP
-                            out[c, 3 * b + j, 3 * a + i] = value
+                            out[c, 3 * b + j, 3 * a + i] = column[b, j]
+
+
+@CellLoop
+def products(  # type: ignore[no-untyped-def]
+    begin, end, x, u, cells, shapes, sizes, matrices, shift, project, by_cell
+):
+    """The same second derivatives times x (N, 3), by cell, (C, 8, 3), N."""
+    cell, moved, room = _cell(np.float64), _cell(np.complex128), _room()
+    dv, out, y = np.empty((7, 3)), np.empty((7, 3)), np.empty(18)
+    for low in range(begin, end, CHUNK):
+        high = min(end, low + CHUNK)
+        v, U, s, V = _frames(u, cells[low:high], shapes[low:high], sizes[low:high])
+        for c in range(low, high):
+            K, less, size = matrices[c], shift[c : c + 1].ravel(), sizes[c]
+            measures = _linearise(v, U, s, V, c - low, size, K, less, cell, y)
+            _amplitudes(x, cells[c], shapes[c], dv)
+            _change(cell, dv, size, K, y, measures, project, moved, room, out)
+            _spread(out, shapes[c], 1.0, by_cell[c])
 
 
 @CellLoop
@@ -395,18 +439,3 @@ def add_blocks(begin, end, tangent, shapes, blocks):  # type: ignore[no-untyped-
                         for a in range(7):
                             total += shapes[c, a, l] * half[a, i, k, j]
                         blocks[c, l, k, i, j] += total
-
-
-@CellLoop
-def apply_tangents(begin, end, x, cells, shapes, tangent, by_cell):  # type: ignore[no-untyped-def]
-    """The tangents times x (N, 3), by cell, (C, 8, 3)."""
-    dv, out = np.empty((7, 3)), np.empty((7, 3))
-    flat, to = dv.reshape(21), out.reshape(21)
-    for c in range(begin, end):
-        _amplitudes(x, cells[c], shapes[c], dv)
-        for n in range(21):
-            total = 0.0
-            for m in range(21):
-                total += tangent[c, n, m] * flat[m]
-            to[n] = total
-        _spread(out, shapes[c], 1.0, by_cell[c])
