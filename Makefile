@@ -4,11 +4,12 @@ VENV := .venv
 BIN := $(VENV)/bin
 # Processes that share the tests, of one thread each.
 JOBS ?= 2
-INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
+# Python compiles what is imported when it is, which is a small part of what is installed.
+INSTALL := $(BIN)/python -m pip install --quiet --no-compile --disable-pip-version-check -c constraints.txt
 
 .PHONY: demo demo-learn test test-slow lint docs bench clean
 
-demo: $(VENV)/view.stamp $(VENV)/learn.stamp
+demo: $(VENV)/demo.stamp
 	$(BIN)/pdcorrect compare examples/unseen_cross.toml --model torsion-exact --converged --frames 20 -o demo
 
 demo-learn: $(VENV)/learn.stamp
@@ -17,11 +18,11 @@ demo-learn: $(VENV)/learn.stamp
 
 # Kernels are compiled once and beside the linters, not by each process of the tests.
 test: $(VENV)/dev.stamp
-	$(MAKE) --jobs=$(JOBS) kernels-trilinear kernels-modes lint
+	$(MAKE) --jobs=3 kernels-trilinear kernels-modes lint
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m "not slow" -n $(JOBS) --dist loadfile --no-loadscope-reorder
 
 test-slow: $(VENV)/dev.stamp
-	$(MAKE) --jobs=$(JOBS) kernels-trilinear kernels-modes
+	$(MAKE) --jobs=2 kernels-trilinear kernels-modes
 	$(BIN)/python -m pytest -m slow
 
 kernels-%: $(VENV)/dev.stamp
@@ -45,9 +46,9 @@ clean:
 $(VENV)/bin/python:
 	$(PYTHON) -m venv $(VENV)
 
-$(VENV)/view.stamp: pyproject.toml constraints.txt | $(VENV)/bin/python
-	$(INSTALL) -e ".[view]"
-	@touch $@
+$(VENV)/demo.stamp: pyproject.toml constraints.txt | $(VENV)/bin/python
+	$(INSTALL) -e ".[view,learn]"
+	@touch $(VENV)/learn.stamp $@
 
 $(VENV)/learn.stamp: pyproject.toml constraints.txt | $(VENV)/bin/python
 	$(INSTALL) -e ".[learn]"
@@ -55,4 +56,4 @@ $(VENV)/learn.stamp: pyproject.toml constraints.txt | $(VENV)/bin/python
 
 $(VENV)/dev.stamp: pyproject.toml constraints.txt | $(VENV)/bin/python
 	$(INSTALL) -e ".[view,learn,cluster,dev]"
-	@touch $(VENV)/view.stamp $(VENV)/learn.stamp $@
+	@touch $(VENV)/demo.stamp $(VENV)/learn.stamp $@
