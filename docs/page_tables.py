@@ -6,18 +6,6 @@ from collections.abc import Callable, Iterator
 
 from records import RECORDS, Rows, number, read
 
-_MOTIONS = ("impulse", "stretch", "torsion")
-_METHODS = {
-    "plain": "coarse PD",
-    "plain, Newton": "coarse Newton",
-    "fitted stiffness": "modulus fitted to this very scene",
-    "best": "best coarse PD",
-    "hybrid, {}-exact": "corrected best coarse",
-    "plain 2×2×2": "intermediate PD (2×2×2)",
-    "hex27": "27-node elements, coarse cells",
-    "best 2×2×2": "`hex8-bubble-mean`, 2×2×2",
-    "best 4×4×4": "`hex8-bubble-mean`, 4×4×4",
-}
 _INTEGRATORS = ("backward-euler", "bdf2", "generalised-alpha", "midpoint")
 _MESHES = {
     "hex8 1x": "coarse mesh, `hex8`",
@@ -26,22 +14,6 @@ _MESHES = {
     "hex27 1x": "coarse mesh, `hex27`",
 }
 _OWN = "examples/bring_your_own/hook.json"
-
-
-def error_and_time() -> Rows:
-    """One exact scene of each motion by several methods."""
-    tables = {table["name"]: table for table in read(RECORDS / "error_time.json")["tables"]}
-    rows = []
-    for method, label in _METHODS.items():
-        cells = [label]
-        for motion in _MOTIONS:
-            table = tables[f"{motion}, exact"]
-            found = {row[0]: row for row in table["rows"]}[method.format(motion)]
-            at = table["headings"].index
-            error, time = found[at("RMS error, mm")], found[at("ms a frame")]
-            cells.append(f"{number(error)} mm, {number(time, 2)} ms")
-        rows.append(cells)
-    return ("RMS error, time a frame", *_MOTIONS), rows
 
 
 def time_and_mesh_error() -> Rows:
@@ -114,6 +86,6 @@ def own_body_runs() -> Rows:
 
 def tables() -> Iterator[tuple[str, Callable[[], Rows]]]:
     """By their names on the pages."""
-    every = (error_and_time, time_and_mesh_error, own_body_evaluation, own_body_runs, gallery)
+    every = (time_and_mesh_error, own_body_evaluation, own_body_runs, gallery)
     for table in every:
         yield table.__name__.replace("_", "-"), table

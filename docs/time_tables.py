@@ -4,11 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
-from statistics import fmean
+from statistics import fmean, median
 from typing import Any
 
 from records import RECORDS, ROOT, Rows, number, read
 
+CHOICE = (
+    "plain, BE", "best coarse, BE", "hybrid torsion-exact", "plain, 1", "best coarse, 1",
+    "best coarse, 2", "learned, 1", "learned, 2", "hex27, 1", "hex27, 2", "plain on 2x2x2, 1",
+    "learned on 2x2x2, 2", "best on 4x4x4, 1",
+)  # fmt: skip
+"""Of the runs of `validation/error_time`, for the page on choosing a solver."""
 FREQUENCIES = "Error of the lowest 10 frequencies, %"
 
 
@@ -40,16 +46,38 @@ def errors() -> Rows:
     return (*heads[:2], *heads[4:]), cells
 
 
-def unlike_bodies() -> Rows:
-    """Errors of all runs on unlike bodies, and their times; of runs with equal errors the first."""
-    heads, rows = table_of("unlike_bodies", "Errors, % of the RMS displacement")
-    short = [head.replace(", backward-euler", ", BE").replace(", generalised-alpha", ", gen.-α")
-             for head in heads]  # fmt: skip
-    rows = [[row[0], *("" if x == "" else number(x, 2) for x in row[2:])] for row in rows]
-    errors = [tuple(row[k] for row in rows[:-1]) for k in range(len(rows[0]))]
-    kept = [k for k, column in enumerate(errors) if column not in errors[:k]]
-    heads = (short[0], *short[2:])
-    return tuple(heads[k] for k in kept), [[row[k] for k in kept] for row in rows]
+def error_time(methods: Sequence[str] = ()) -> Rows:
+    """Errors over unlike bodies and of the thesis's motions, %, and median times, ms, by method."""
+    figures = read(RECORDS / "error_time.json")["figures"]
+    heads, rows = table_of("error_time", "Errors, % of the RMS displacement")
+    times = table_of("error_time", "Time a frame, ms")[1]
+    motions = [row for row in rows if row[0] in ("impulse", "stretch", "torsion")]
+    cells = []
+    for k, name in enumerate(heads[3:]):
+        if methods and name not in methods:
+            continue
+        spread = [figures[f"{kind}, {name}, %"] for kind in ("mean", "median", "worst")]
+        spent = median(row[1 + k] for row in times if row[1 + k] is not None)
+        cells.append(
+            [name, *(number(x, 2) for x in (*spread, *(r[3 + k] for r in motions), spent))]
+        )
+    kinds = ("mean", "median", "worst")
+    return ("run, steps a frame", *kinds, *(row[0] for row in motions), "ms a frame"), cells
+
+
+def beside_the_front() -> Rows:
+    """Speed-up at equal error and error at equal time, beside what needs no training."""
+    figures = read(RECORDS / "error_time.json")["figures"]
+    heads, rows = table_of("error_time", "Beside the front of what needs no training")
+    kinds = ("median", "worst")
+    cells = [
+        [
+            run,
+            *(number(figures[f"{run}, {what}, {kind}"], 2) for what in heads[2:] for kind in kinds),
+        ]
+        for run in dict.fromkeys(row[1] for row in rows)
+    ]
+    return ("run", *(f"{what}, {kind}" for what in heads[2:] for kind in kinds)), cells
 
 
 def unlike_families() -> Rows:
@@ -84,7 +112,9 @@ def tables() -> Iterator[tuple[str, Callable[[], Rows]]]:
     yield "turek-hron-rest", partial(as_measured, "turek_hron", "CSM1", 4)
     yield "turek-hron-swing", partial(as_measured, "turek_hron", "CSM3", 4)
     yield "tapered-membrane", partial(as_measured, "tapered_membrane", "Frequencies", 5)
-    yield "unlike-bodies", unlike_bodies
+    yield "error-time-all", error_time
+    yield "error-time", partial(error_time, CHOICE)
+    yield "beside-the-front", beside_the_front
     yield "unlike-families", unlike_families
     yield "aims", partial(aims, "unlike_families")
     yield "frequencies", partial(as_measured, "unlike_families", FREQUENCIES)

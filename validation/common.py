@@ -93,14 +93,16 @@ COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#0
 MARKS = "osD^vP*"
 
 
-def panels(width: float, height: float, count: int = 1, **options: Any) -> tuple[Any, Any]:
-    """A figure of so many inches and its axes side by side, one or an array of them."""
+def panels(
+    width: float, height: float, count: int = 1, rows: int = 1, **options: Any
+) -> tuple[Any, Any]:
+    """A figure of so many inches and its axes, ``count`` side by side: one or an array of them."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(figure)
-    return figure, figure.subplots(1, count, **options)
+    return figure, figure.subplots(rows, count, **options)
 
 
 def save(figure: Any, path: Path, legend_of: Any = None, columns: int = 5) -> None:

@@ -3,7 +3,8 @@
 A case is a folder with ``README.md`` (its question), ``run.py`` and ``expected.json``.  ``run.py``
 has ``case(quick)``, which gives an `Outcome`, or ``parts(quick)``, which gives functions by name,
 each of which gives the outcome of a part; a run that was ended goes on with the first part that
-is not done.  It may have ``finding(record)``, a sentence, and ``draw(record, path)``.
+is not done.  It may have ``summary(record)``, the outcome of all parts of a full run together,
+``finding(record)``, a sentence, and ``draw(record, path)``.
 """
 
 from __future__ import annotations
@@ -268,6 +269,9 @@ def run_case(
             save(place, part)
             record.seconds = round(record.seconds + part.seconds, 3)
             record.add(part.figures, part.tables)
+        if hasattr(case.module, "summary") and not quick:
+            summary = case.module.summary(record)
+            record.add(summary.figures, [vars(table) for table in summary.tables])
     except (CaseFilesError, OutputError):
         raise
     except Exception:  # of a case's own code

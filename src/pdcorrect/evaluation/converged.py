@@ -198,7 +198,7 @@ def error_estimate(run: Trajectory, *, on_step: OnStep | None = None) -> NDArray
 
     It is the distance to another run, with the learned element on 2x2x2 cells for each of the
     run's, by generalised-alpha with twice as many substeps.  That run takes 10 to 20 times as
-    long.  How near the estimate is: `validation/unlike_bodies`.
+    long.  How near the estimate is: `validation/error_time`.
 
     Parameters
     ----------
