@@ -52,10 +52,10 @@ def outside(obstacle, count=200):
 def test_derivatives_of_gaps_are_those_of_differences(shape):
     obstacle, e = RigidObstacle(SHAPES[shape]), 1e-6
     x = outside(obstacle)
-    first, second = obstacle.normals(x, TIME), obstacle.curvatures(x, TIME)
+    first, second = obstacle.derivatives(x, TIME)
     moved = [(x + e * axis, x - e * axis) for axis in np.eye(3)]
     gaps = [obstacle.gaps(a, TIME) - obstacle.gaps(b, TIME) for a, b in moved]
-    slopes = [obstacle.normals(a, TIME) - obstacle.normals(b, TIME) for a, b in moved]
+    slopes = [obstacle.derivatives(a, TIME)[0] - obstacle.derivatives(b, TIME)[0] for a, b in moved]
     np.testing.assert_allclose(first, np.stack(gaps, axis=1) / (2 * e), atol=1e-8)
     np.testing.assert_allclose(second, np.stack(slopes, axis=2) / (2 * e), atol=1e-8)
     np.testing.assert_allclose(np.linalg.norm(first, axis=1), 1.0, rtol=1e-14)

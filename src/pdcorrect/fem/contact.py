@@ -19,16 +19,18 @@ e the slip velocity times the step.  It is convex and dissipative.
 
 from __future__ import annotations
 
+import math
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
 
 import numpy as np
 import scipy.sparse as sp
+from numba import njit
 from numpy.typing import NDArray
 
 from pdcorrect.errors import PdcorrectWarning, SceneError
+from pdcorrect.fem.decomposition import OPTIONS
 from pdcorrect.fem.hexahedron import VTK_CORNERS
 from pdcorrect.fem.mesh import HexMesh, boundary_faces
 from pdcorrect.fem.obstacles import RigidObstacle
@@ -52,13 +54,18 @@ _LINE = np.array([0.0, 0.5, 1.0])
 _SIMPSON = np.array([1.0, 4.0, 1.0]) / 6.0
 
 
-def barrier(s: Array) -> tuple[Array, Array, Array]:
-    """B and its first two derivatives; infinite value for s <= 0."""
-    inside = np.clip(s, 1e-100, 1.0)
-    e, log = inside - 1.0, np.log(inside)
-    value = np.where(s > 0.0, -(e**2) * log, np.inf)
-    ratio = e / inside
-    return value, -2.0 * e * log - e * ratio, -2.0 * log - 4.0 * ratio + ratio**2
+@njit(**OPTIONS)
+def barrier(s):  # type: ignore[no-untyped-def]
+    """B and its first two derivatives at s (n,); infinite value for s <= 0."""
+    value, first, second = np.empty_like(s), np.empty_like(s), np.empty_like(s)
+    for i in range(len(s)):
+        inside = min(max(s[i], 1e-100), 1.0)
+        e, log = inside - 1.0, math.log(inside)
+        ratio = e / inside
+        value[i] = -e * e * log if s[i] > 0.0 else math.inf
+        first[i] = -2.0 * e * log - e * ratio
+        second[i] = -2.0 * log - 4.0 * ratio + ratio * ratio
+    return value, first, second
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,12 +137,7 @@ class Touching:
     force: Array
     slope: Array
     normals: Array
-    bend: Callable[[], Array]
-
-    @cached_property
-    def curvatures(self) -> Array:
-        """Computed where they are asked for."""
-        return self.bend()
+    curvatures: Array
 
     def matrices(self, project: bool = False) -> Array:
         """Second derivatives (n, 3, 3) of the energies, N/m.
@@ -149,7 +151,7 @@ class Touching:
 
 _NOTHING = Touching(
     np.zeros(0, dtype=np.int64), 0.0, np.zeros(0), np.zeros(0), np.zeros((0, 3)),
-    lambda: np.zeros((0, 3, 3)),
+    np.zeros((0, 3, 3)),
 )  # fmt: skip
 
 
@@ -244,11 +246,10 @@ class Contact:
                 continue
             areas = self.points.areas[points]
             value, first, second = barrier(gaps[points] / D)
-            normals = obstacle.normals(x[points], time)
+            normals, curvatures = obstacle.derivatives(x[points], time)
             force, slope = -k * areas * first, k / D * areas * second
             energy = float(k * D * (areas @ value))
-            bend = partial(obstacle.curvatures, x[points], time)
-            out.append(Touching(points, energy, force, slope, normals, bend))
+            out.append(Touching(points, energy, force, slope, normals, curvatures))
         return out
 
     def longest_step(self, x: Array, way: Array, time: float) -> float:

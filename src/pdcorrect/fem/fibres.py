@@ -11,6 +11,7 @@ fibres of length r, as projective dynamics wants it: A^T w V A belongs to the gl
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import ClassVar
 
 import numpy as np
@@ -83,6 +84,10 @@ class Fibres:
             np.concatenate(rest), np.concatenate(weights), stretching, owner_cells, gradient,
         )  # fmt: skip
 
+    @cached_property
+    def _transposed(self) -> sp.csr_matrix:
+        return self.stretching.T.tocsr()
+
     def activations(self, time: float) -> Array:
         """R of each actuator at a time (s)."""
         return np.array([np.interp(time, *table.T) for table in self.tables])
@@ -105,15 +110,12 @@ class Fibres:
         excess = self.stretched(u)[0] - self.activations(time)[self.owners]
         return np.asarray(self.weights * excess)
 
-    def energy(self, u: Array, time: float) -> float:
-        """J."""
-        tensions = self.tensions(u, time)
-        return float(0.5 * (tensions / self.weights) @ tensions)
-
-    def forces(self, u: Array, time: float) -> Array:
-        """Of the fibres on the nodes, (N, 3), N."""
-        _, along = self.stretched(u)
-        return np.asarray(-(self.stretching.T @ (self.tensions(u, time)[:, None] * along)))
+    def energy_and_forces(self, u: Array, time: float) -> tuple[float, Array]:
+        """J, and of the fibres on the nodes, (N, 3), N."""
+        length, along = self.stretched(u)
+        excess = length - self.activations(time)[self.owners]
+        tensions = self.weights * excess
+        return 0.5 * float(excess @ tensions), -(self._transposed @ (tensions[:, None] * along))
 
     def matrices(self, u: Array, time: float, project: bool = False) -> Array:
         """Second derivatives of the energy by F m, (P, 3, 3), J.
@@ -173,7 +175,9 @@ class FibreTangent:
         """Times x (N + B, 3)."""
         A, out = self.fibres.stretching, np.zeros_like(x)
         nodes = A.shape[1]
-        out[:nodes] = A.T @ np.einsum("pij,pj->pi", self.matrices, A @ x[:nodes])
+        out[:nodes] = self.fibres._transposed @ np.einsum(
+            "pij,pj->pi", self.matrices, A @ x[:nodes]
+        )
         return out
 
     def add_to(self, blocks: Array) -> None:
