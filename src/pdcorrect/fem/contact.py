@@ -30,6 +30,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from pdcorrect.errors import PdcorrectWarning, SceneError
+from pdcorrect.fem.assembly import sparse_times
 from pdcorrect.fem.decomposition import OPTIONS
 from pdcorrect.fem.hexahedron import VTK_CORNERS
 from pdcorrect.fem.mesh import HexMesh, boundary_faces
@@ -224,8 +225,7 @@ class Contact:
 
     def at(self, nodal: Array) -> Array:
         """Values at the points (n, 3) of a nodal field or configuration."""
-        nodes = self.points.operator.shape[1]
-        return np.asarray(self.points.operator @ nodal[:nodes])
+        return sparse_times(self.points.operator, nodal)
 
     def gaps(self, nodal: Array, time: float) -> Array:
         """Of each obstacle and point, (obstacles, n), m."""
@@ -259,15 +259,46 @@ class Contact:
     def spread(self, values: Array, unknowns: int) -> Array:
         """Values (n, 3) at the points as nodal ones, on configurations (unknowns, 3)."""
         out = np.zeros((unknowns, 3))
-        out[: self._transposed.shape[0]] = self._transposed @ values
+        out[: self._transposed.shape[0]] = sparse_times(self._transposed, values)
         return out
+
+    def add_product(self, points: Index, matrices: Array, x: Array, out: Array) -> None:
+        """Add to ``out`` matrices (m, 3, 3) of some points times x, both on configurations."""
+        A = self.points.operator
+        _add_product(A.indptr, A.indices, A.data, points, matrices, x, out)
 
     def add_to(self, blocks: Array, matrices: Array, points: Index) -> None:
         """Add matrices (m, 3, 3) of some points to those of their cells, (C, L, L, 3, 3)."""
-        if not len(points):
-            return
-        local, width = self.points.local[points], self.points.local.shape[1]
-        more = np.einsum("pk,pl,pij->pklij", local, local, matrices, optimize=True)
-        cells = self.points.cells[points]  # in order
-        first = np.flatnonzero(np.diff(cells, prepend=-1))
-        blocks[cells[first], :width, :width] += np.add.reduceat(more, first)
+        _add_blocks(self.points.cells, self.points.local, points, matrices, blocks)
+
+
+@njit(**OPTIONS)
+def _add_product(starts, nodes, shares, points, matrices, x, out):  # type: ignore[no-untyped-def]
+    """Add A^T H A x for A in compressed rows, of which ``points`` have an H."""
+    at = np.empty(3)
+    for m in range(len(points)):
+        row = range(starts[points[m]], starts[points[m] + 1])
+        at[:] = 0.0
+        for k in row:
+            for i in range(3):
+                at[i] += shares[k] * x[nodes[k], i]
+        for i in range(3):
+            image = 0.0
+            for j in range(3):
+                image += matrices[m, i, j] * at[j]
+            for k in row:
+                out[nodes[k], i] += shares[k] * image
+
+
+@njit(**OPTIONS)
+def _add_blocks(cells, local, points, matrices, blocks):  # type: ignore[no-untyped-def]
+    """Add A^T H A to the matrices of the cells."""
+    for m in range(len(points)):
+        block, shares = blocks[cells[points[m]]], local[points[m]]
+        for k in range(len(shares)):
+            for l in range(len(shares)):
+                both = shares[k] * shares[l]
+                if both != 0.0:
+                    for i in range(3):
+                        for j in range(3):
+                            block[k, l, i, j] += both * matrices[m, i, j]

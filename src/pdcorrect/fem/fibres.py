@@ -18,6 +18,7 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
+from pdcorrect.fem.assembly import sparse_times
 from pdcorrect.fem.clamps import Selector
 from pdcorrect.fem.elastic_body import ElasticBody
 from pdcorrect.scene import Actuator
@@ -101,7 +102,7 @@ class Fibres:
 
     def stretched(self, u: Array) -> tuple[Array, Array]:
         """Length l (P,) and direction (P, 3) of fibres for displacements u (N, 3), m."""
-        fibres = self.rest + self.stretching @ u
+        fibres = self.rest + sparse_times(self.stretching, u)
         length = np.linalg.norm(fibres, axis=1)
         return length, fibres / np.maximum(length, _SHORTEST)[:, None]
 
@@ -115,7 +116,9 @@ class Fibres:
         length, along = self.stretched(u)
         excess = length - self.activations(time)[self.owners]
         tensions = self.weights * excess
-        return 0.5 * float(excess @ tensions), -(self._transposed @ (tensions[:, None] * along))
+        return 0.5 * float(excess @ tensions), -sparse_times(
+            self._transposed, tensions[:, None] * along
+        )
 
     def matrices(self, u: Array, time: float, project: bool = False) -> Array:
         """Second derivatives of the energy by F m, (P, 3, 3), J.
@@ -173,11 +176,10 @@ class FibreTangent:
 
     def apply(self, x: Array) -> Array:
         """Times x (N + B, 3)."""
-        A, out = self.fibres.stretching, np.zeros_like(x)
-        nodes = A.shape[1]
-        out[:nodes] = self.fibres._transposed @ np.einsum(
-            "pij,pj->pi", self.matrices, A @ x[:nodes]
-        )
+        out, changes = np.zeros_like(x), sparse_times(self.fibres.stretching, x)
+        tensions = np.einsum("pij,pj->pi", self.matrices, changes)
+        forces = sparse_times(self.fibres._transposed, tensions)
+        out[: len(forces)] = forces
         return out
 
     def add_to(self, blocks: Array) -> None:

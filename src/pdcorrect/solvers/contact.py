@@ -298,11 +298,10 @@ class ContactTangent:
 
     def apply(self, x: Array) -> Array:
         """Times x (N + B, 3)."""
-        at = self.contact.at(x)
-        out = np.zeros_like(at)
+        out = np.zeros_like(x)
         for points, matrices in self.parts:
-            out[points] += np.einsum("mij,mj->mi", matrices, at[points])
-        return self.contact.spread(out, len(x))
+            self.contact.add_product(points, matrices, x, out)
+        return out
 
     def add_to(self, blocks: Array) -> None:
         """Add to the cells' matrices (C, L, L, 3, 3)."""

@@ -55,7 +55,7 @@ class Rotations:
         Those of absurd or infinite deformations mean nothing: such a step fails by name.
         """
         u = y[: len(self._problem.positions)] - self._problem.positions
-        mean = np.einsum("cki,ckj->cij", u[self._problem.cells], self._mean, optimize=True)
+        mean = np.swapaxes(u[self._problem.cells], 1, 2) @ self._mean
         return nearest_rotation(np.eye(3) + np.clip(np.nan_to_num(mean), -_LARGEST, _LARGEST))
 
     def since(self, before: Array, y: Array) -> Array:
