@@ -20,6 +20,11 @@ from pdcorrect.state import State
 
 Array = NDArray[np.float64]
 
+_OF_GAP = 1e-3
+"""Of the smallest gap: length up to which Newton steps are trusted."""
+_CLEAR = 1e-6
+"""Of an obstacle's distance: least gap to begin with; Newton's steps only double smaller ones."""
+
 
 @dataclass(frozen=True, eq=False)
 class Sliding:
@@ -166,7 +171,8 @@ class ContactTerm:
     def _reachable(self, nodal: Array) -> bool:
         """Whether nodes can be there at the end, and no obstacle has passed through the body."""
         contact, x = self._contact, self._contact.at(nodal)
-        return bool(contact.gaps_at(x, self._end).min() > 0.0) and all(
+        clear = contact.gaps_at(x, self._end) > _CLEAR * np.array(contact.distances)[:, None]
+        return bool(clear.all()) and all(
             not way.any() or obstacle.first_hit(carried, x - carried, self._end) > 1.0
             for obstacle, carried, way in zip(
                 contact.obstacles, self._carried, self._ways, strict=True
@@ -177,6 +183,14 @@ class ContactTerm:
         """Whether a point is within an obstacle's distance at a configuration."""
         gaps = self._contact.gaps_at(self._points(y), self._end)
         return bool((gaps < np.array(self._contact.distances)[:, None]).any())
+
+    def trusted(self, y: Array) -> float:
+        """Length up to which a Newton step at y tells the distance from the minimum, m.
+
+        Far too near an obstacle such a step is about as long as the gap, however small that is.
+        """
+        gap = self._contact.gaps_at(self._points(y), self._end).min()
+        return _OF_GAP * float(gap) / self._stage.gain
 
     def value_and_gradient(self, y: Array) -> tuple[float, Array]:
         """J and N, (N + B, 3)."""

@@ -67,6 +67,9 @@ class Objective(Protocol):
     def longest_step(self, p: Array, direction: Array) -> float:
         """Share of a direction, at most 1, along which the function is finite."""
 
+    def trusted(self, p: Array) -> float:
+        """Length up to which a Newton step at p tells the distance from the minimum, m."""
+
 
 @dataclass(frozen=True)
 class MinimiserOptions:
@@ -218,11 +221,12 @@ def minimise(
         length = largest_displacement(direction)
         if length <= threshold:
             exact, estimate = newton_step(objective, p, gradient, solve, direction)
-            if estimate <= options.tolerance * (1.0 if iteration else options.unmoved):
+            within = min(options.tolerance, objective.trusted(p))
+            if estimate <= within * (1.0 if iteration else options.unmoved):
                 status = Status.CONVERGED
                 break
-            if estimate > options.tolerance:
-                threshold = length * max(0.05, min(0.5, 0.5 * options.tolerance / estimate))
+            if estimate > within:
+                threshold = length * max(0.05, min(0.5, 0.5 * within / estimate))
             if options.history and math.isfinite(estimate):
                 direction = exact
         if iteration == options.max_iterations:
@@ -357,7 +361,7 @@ def newton_loop(
             break
         step, exact = direction(p, gradient)
         estimate = largest_displacement(step) if exact else math.inf
-        if estimate <= options.tolerance:
+        if estimate <= options.tolerance and estimate <= objective.trusted(p):
             status = Status.CONVERGED
             break
         if not exact and largest_displacement(step) <= options.tolerance:
