@@ -91,7 +91,7 @@ class Fibres:
 
     def activations(self, time: float) -> Array:
         """R of each actuator at a time (s)."""
-        return np.array([np.interp(time, *table.T) for table in self.tables])
+        return np.array([np.interp(time, table[:, 0], table[:, 1]) for table in self.tables])
 
     def shares(self, time: float) -> tuple[Array, ...]:
         """Derivatives of each actuator's r at a time (s) by the stretches of its table, (rows,)."""
@@ -163,8 +163,10 @@ class Fibres:
     def blocks(self, matrices: Array) -> Array:
         """A^T H A by cell, (c, K, K, 3, 3), N/m, for H (P, 3, 3), J, in the order of ``cells``."""
         A = self.gradients
-        H = matrices.reshape(*A.shape[:2], 3, 3)
-        return np.asarray(np.einsum("cqk,cqij,cql->cklij", A, H, A, optimize=True))
+        cells, points, nodes = A.shape
+        H = matrices.reshape(cells, points, 1, 3, 3)
+        weighted = (A[..., None, None] * H).reshape(cells, points, -1)
+        return np.asarray(np.swapaxes(A, 1, 2) @ weighted).reshape(cells, nodes, nodes, 3, 3)
 
 
 @dataclass(frozen=True, eq=False)
