@@ -30,11 +30,14 @@ _REST = np.eye(3), np.zeros(3)
 _SHORT = 1e-6
 """Time over which velocities are means, s."""
 _HALF_SPACE, _SLAB, _RADIAL = 0.0, 1.0, 2.0
-"""Kinds of coordinates of points X, with a centre c, an axis a and a size s.
+"""Kinds of coordinates of points X: with a centre c, an axis a and a size s
 
-a . (X - c), |a . (X - c)| - s and |X - c - a . (X - c) a| - s; balls are radial, of axis 0.  A row
-of a table of coordinates is the kind, c, a and s.
+    a . (X - c) - s,    |a . (X - c)| - s,    |X - c - a . (X - c) a| - s.
+
+Balls are radial, of axis 0.
 """
+_KIND, _CENTRE, _AXIS, _SIZE = 0, 1, 4, 7
+"""Columns of a table of coordinates, one a row."""
 
 
 @njit(**OPTIONS)
@@ -49,21 +52,21 @@ def _coordinate(row, X, g):  # type: ignore[no-untyped-def]
     """Q of a row at X (3,), and 1 over the radius of its level set; its derivative into g (3,)."""
     along = 0.0
     for i in range(3):
-        along += row[4 + i] * (X[i] - row[1 + i])
-    if row[0] != _RADIAL:
-        both = row[0] == _SLAB and along < 0.0
+        along += row[_AXIS + i] * (X[i] - row[_CENTRE + i])
+    if row[_KIND] != _RADIAL:
+        both = row[_KIND] == _SLAB and along < 0.0
         for i in range(3):
-            g[i] = -row[4 + i] if both else row[4 + i]
-        return (-along if both else along) - row[7], 0.0
+            g[i] = -row[_AXIS + i] if both else row[_AXIS + i]
+        return (-along if both else along) - row[_SIZE], 0.0
     square = 0.0
     for i in range(3):
-        g[i] = X[i] - row[1 + i] - along * row[4 + i]
+        g[i] = X[i] - row[_CENTRE + i] - along * row[_AXIS + i]
         square += g[i] * g[i]
     length = math.sqrt(square)
     bend = 1.0 / max(length, 1e-300)
     for i in range(3):
         g[i] *= bend
-    return length - row[7], bend
+    return length - row[_SIZE], bend
 
 
 @njit(**OPTIONS)
@@ -71,18 +74,21 @@ def _interval(row, X, way):  # type: ignore[no-untyped-def]
     """The shares of the path X + share way between which q < 0; inf, -inf for none."""
     along, speed = 0.0, 0.0
     for i in range(3):
-        along += row[4 + i] * (X[i] - row[1 + i])
-        speed += row[4 + i] * way[i]
-    if row[0] != _RADIAL:
-        low, high = -row[7] if row[0] == _SLAB else -math.inf, row[7]
+        along += row[_AXIS + i] * (X[i] - row[_CENTRE + i])
+        speed += row[_AXIS + i] * way[i]
+    if row[_KIND] != _RADIAL:
+        low, high = -row[_SIZE] if row[_KIND] == _SLAB else -math.inf, row[_SIZE]
         if speed == 0.0:
             inside = low < along < high
             return (-math.inf, math.inf) if inside else (math.inf, -math.inf)
         one, other = (low - along) / speed, (high - along) / speed
         return min(one, other), max(one, other)
-    a, b, c = 0.0, 0.0, -(row[7] ** 2)
+    a, b, c = 0.0, 0.0, -(row[_SIZE] ** 2)
     for i in range(3):
-        arm, step = X[i] - row[1 + i] - along * row[4 + i], way[i] - speed * row[4 + i]
+        arm, step = (
+            X[i] - row[_CENTRE + i] - along * row[_AXIS + i],
+            way[i] - speed * row[_AXIS + i],
+        )
         a, b, c = a + step * step, b + arm * step, c + arm * arm
     if a == 0.0:
         return (-math.inf, math.inf) if c < 0.0 else (math.inf, -math.inf)
@@ -125,7 +131,9 @@ def _derivatives(table, R, b, x):  # type: ignore[no-untyped-def]
             for i in range(3):
                 n[i] += q * g[i]
                 for j in range(3):
-                    across = (1.0 if i == j else 0.0) - row[4 + i] * row[4 + j] - g[i] * g[j]
+                    across = (
+                        (1.0 if i == j else 0.0) - row[_AXIS + i] * row[_AXIS + j] - g[i] * g[j]
+                    )
                     H[i, j] += q * bend * across + (g[i] * g[j] if several else 0.0)
         d = math.sqrt(square) if square > 0.0 else math.nan
         n /= d

@@ -6,7 +6,7 @@ import os
 import threading
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import cache
 from numbers import Real
@@ -19,7 +19,7 @@ from threadpoolctl import ThreadpoolController
 
 from pdcorrect.errors import InputError
 from pdcorrect.fem.clamps import check_held
-from pdcorrect.fem.factorisation import Backend, check_backend
+from pdcorrect.fem.factorisation import Backend, NotPositiveDefinite, check_backend
 from pdcorrect.fem.problem import Problem
 from pdcorrect.solvers.follower import settle
 from pdcorrect.solvers.integrators import Integrator, backward_euler
@@ -305,7 +305,8 @@ class ImplicitStepper:
         pressed = objective.contact is not None and objective.contact.near(y)
         seen = self._sees_saddles and status is Status.CONVERGED
         if status is Status.LINE_SEARCH or (status.ok and pressed and not seen):
-            return below_saddle(objective, y, self.preconditioner(objective, y))
+            with suppress(NotPositiveDefinite):
+                return below_saddle(objective, y, self.preconditioner(objective, y))
         return None
 
     def _solved(self, objective: StepObjective, start: Array, options: MinimiserOptions) -> Minimum:
