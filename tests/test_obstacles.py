@@ -10,6 +10,7 @@ from pdcorrect.fem.contact import barrier
 from pdcorrect.fem.obstacles import RigidObstacle
 from pdcorrect.scene import Box, Cylinder, Plane, Sphere
 from pdcorrect.solvers.implicit import _Effort
+from pdcorrect.solvers.tangent_solver import TangentFactory
 
 MOTION = {
     "times": [0, 1], "displacement": [[0, 0, 0], [0.1, 0, 0.2]], "rotation": [0, 50], "axis": "y",
@@ -52,10 +53,10 @@ def outside(obstacle, count=200):
 def test_derivatives_of_gaps_are_those_of_differences(shape):
     obstacle, e = RigidObstacle(SHAPES[shape]), 1e-6
     x = outside(obstacle)
-    first, second = obstacle.normals(x, TIME), obstacle.curvatures(x, TIME)
+    first, second = obstacle.derivatives(x, TIME)
     moved = [(x + e * axis, x - e * axis) for axis in np.eye(3)]
     gaps = [obstacle.gaps(a, TIME) - obstacle.gaps(b, TIME) for a, b in moved]
-    slopes = [obstacle.normals(a, TIME) - obstacle.normals(b, TIME) for a, b in moved]
+    slopes = [obstacle.derivatives(a, TIME)[0] - obstacle.derivatives(b, TIME)[0] for a, b in moved]
     np.testing.assert_allclose(first, np.stack(gaps, axis=1) / (2 * e), atol=1e-8)
     np.testing.assert_allclose(second, np.stack(slopes, axis=2) / (2 * e), atol=1e-8)
     np.testing.assert_allclose(np.linalg.norm(first, axis=1), 1.0, rtol=1e-14)
@@ -290,6 +291,39 @@ def test_a_path_that_ends_on_the_surface_is_stepped_whole(height, speed, step):
     )
     run = pc.rollout(pc.Newton(pc.discretise(scene)), frames=3)
     assert set(run.stats["status"]) == {"CONVERGED"}
+
+
+@pytest.mark.parametrize("stepper", [pc.Newton, pc.ProjectiveDynamics])
+def test_a_body_too_near_an_obstacle_is_pushed_away(stepper):
+    """Newton's steps are as short as the gap there, far from the minimum."""
+    problem = pc.discretise(block([FLOOR], 0.02, cells=(1, 1, 1)))
+    state = problem.initial_state()
+    near = pc.State(state.positions - np.array([0, 0, 0.02 - 1e-13]), state.velocities)
+    result = stepper(problem)(near)
+    assert result.status.ok
+    assert result.stats["smallest_gap"] > 0.1 * problem.contact.distances[0]
+    assert result.residual < 1e-3 * 9.81 * problem.mass.sum()
+
+
+@pytest.mark.parametrize("stepper", [pc.Newton, pc.ProjectiveDynamics])
+def test_a_column_that_a_plate_squeezes_ends_at_a_minimum(stepper):
+    """Straight it would be at a saddle, along which no force shows the way down."""
+    plate = {
+        "shape": "plane", "point": [0, 0, 0.25], "normal": [0, 0, -1],
+        "motion": {"times": [0, 1], "displacement": [[0, 0, 0], [0, 0, -0.03]]},
+    }  # fmt: skip
+    foot = [{"region": {"plane": "z", "at": "min"}}]
+    still = {"step": 1.0, "integrator": "quasi-static"}
+    scene = block([plate], gravity=(0, 0, 0), cells=(1, 1, 5), clamps=foot, time=still)
+    problem = pc.discretise(scene)
+    moved, state = stepper(problem), problem.initial_state()
+    result = moved(state)
+    assert result.status.ok
+    aside = np.abs(result.state.positions - problem.positions)[:, :2].max()
+    assert aside > 0.1 * problem.cell_size
+    y = np.concatenate([result.state.positions, result.modes])
+    _, exact = TangentFactory(problem).factorise(moved.objective(state, None, 1.0), y)
+    assert exact
 
 
 def test_a_moving_plate_does_not_pass_through_a_body():

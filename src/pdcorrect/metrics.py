@@ -235,7 +235,7 @@ def _initial_energies(run: Trajectory, problem: Problem | None) -> tuple[float, 
         kinetic = 0.5 * float(np.vdot(velocities, problem.mass_times(velocities)))
         elastic = problem.energy(positions)
         for one in problem.attached:
-            elastic += one.energy(positions - problem.positions, run.times[0])
+            elastic += one.energy_and_forces(positions - problem.positions, run.times[0])[0]
         return kinetic, elastic
     moves = velocities.any() or (positions != run.points).any()
     if moves or "actuator_work" in run.stats:

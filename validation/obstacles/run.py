@@ -8,7 +8,7 @@ from functools import partial
 
 import common
 import numpy as np
-from scenes import SCENES
+from scenes import SCENES, UNDECIDED
 
 import pdcorrect as pc
 from pdcorrect.errors import PdcorrectWarning
@@ -44,7 +44,8 @@ def part(name: str) -> common.Outcome:
         runs["Newton"] = pc.rollout(pc.Newton(problem), on_failure="continue")
         moved = np.linalg.norm(runs["Newton"].positions - problem.positions, axis=2).max()
         apart = np.linalg.norm(runs["PD"].positions - runs["Newton"].positions, axis=2).max()
-        figures[f"{name}, {element}, distance"] = apart / moved
+        if name != UNDECIDED:
+            figures[f"{name}, {element}, distance"] = apart / moved
         for method, run in runs.items():
             gap = float(run.stats["smallest_gap"].min()) / problem.cell_size
             statuses = run.stats["status"]

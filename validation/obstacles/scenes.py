@@ -42,7 +42,9 @@ FOOT = {"region": {"plane": "z", "at": "min"}}
 INCLINED = {"kind": "gravity", "acceleration": [4.905, 0.0, -8.496]}
 """Gravity, seen from a floor at 30 degrees, whose tangent is 0.58."""
 LID = {"shape": "plane", "point": [0.0, 0.0, SIDE], "normal": [0.0, 0.0, -1.0]}
-CORNER = {"shape": "box", "box": [3 * [SIDE + 0.005], 3 * [SIDE + 0.2]]}
+DIAGONAL = {"shape": "box", "box": [3 * [SIDE + 0.005], 3 * [SIDE + 0.2]]}
+CORNER = {"shape": "box", "box": [[SIDE + x for x in (0.005, 0.01, 0.015)], 3 * [SIDE + 0.2]]}
+"""A face of it reaches the body's corner exactly at the end of a step."""
 CALM = {"mass": 20.0}
 
 SCENES = {
@@ -54,6 +56,9 @@ SCENES = {
     ),
     "incline": scene(20, obstacles=[{**FLOOR, "friction": 0.3}], loads=[INCLINED]),
     "corner": scene(20, clamps=[FOOT], obstacles=[moved(CORNER, 3 * [-0.045], 0.15)]),
+    "corner on corner": scene(
+        20, clamps=[FOOT], obstacles=[moved(DIAGONAL, 3 * [-0.045], 0.15)]
+    ),
     "press": scene(
         25, obstacles=[FLOOR, moved(LID, [0.0, 0.0, -SIDE / 2], 0.2)], damping=CALM
     ),
@@ -62,4 +67,6 @@ SCENES = {
         material={"poisson": 0.49},
     ),
 }  # fmt: skip
-"""A plate squeezed to a fifth, a cube that slides, one that a box pokes, one at half its height."""
+"""A plate squeezed to a fifth, a cube that slides, two that a box pokes, one at half its height."""
+UNDECIDED = "corner on corner"
+"""Slides off to any of three sides."""

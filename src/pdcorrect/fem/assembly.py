@@ -68,6 +68,11 @@ def summed_cells(cells: NDArray[np.int64], blocks: Array, count: int) -> sp.csr_
     return sp.csr_matrix(sp.coo_matrix(entries, shape=(count, count)))
 
 
+def sparse_times(matrix: sp.csr_matrix, x: Array) -> Array:
+    """A sparse matrix times x (n, 3): `scipy.sparse`, whose checks take longer on small bodies."""
+    return np.asarray(kernels.sparse_times(matrix.indptr, matrix.indices, matrix.data, x))
+
+
 def scatter(cells: NDArray[np.int64], values: Array, count: int) -> Array:
     """Sum cell-wise nodal values (C, K, 3) into (count, 3)."""
     flat = cells.ravel()

@@ -19,16 +19,19 @@ e the slip velocity times the step.  It is convex and dissipative.
 
 from __future__ import annotations
 
+import math
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
 
 import numpy as np
 import scipy.sparse as sp
+from numba import njit
 from numpy.typing import NDArray
 
 from pdcorrect.errors import PdcorrectWarning, SceneError
+from pdcorrect.fem.assembly import sparse_times
+from pdcorrect.fem.decomposition import OPTIONS
 from pdcorrect.fem.hexahedron import VTK_CORNERS
 from pdcorrect.fem.mesh import HexMesh, boundary_faces
 from pdcorrect.fem.obstacles import RigidObstacle
@@ -52,13 +55,18 @@ _LINE = np.array([0.0, 0.5, 1.0])
 _SIMPSON = np.array([1.0, 4.0, 1.0]) / 6.0
 
 
-def barrier(s: Array) -> tuple[Array, Array, Array]:
-    """B and its first two derivatives; infinite value for s <= 0."""
-    inside = np.clip(s, 1e-100, 1.0)
-    e, log = inside - 1.0, np.log(inside)
-    value = np.where(s > 0.0, -(e**2) * log, np.inf)
-    ratio = e / inside
-    return value, -2.0 * e * log - e * ratio, -2.0 * log - 4.0 * ratio + ratio**2
+@njit(**OPTIONS)
+def barrier(s):  # type: ignore[no-untyped-def]
+    """B and its first two derivatives at s (n,); infinite value for s <= 0."""
+    value, first, second = np.empty_like(s), np.empty_like(s), np.empty_like(s)
+    for i in range(len(s)):
+        inside = min(max(s[i], 1e-100), 1.0)
+        e, log = inside - 1.0, math.log(inside)
+        ratio = e / inside
+        value[i] = -e * e * log if s[i] > 0.0 else math.inf
+        first[i] = -2.0 * e * log - e * ratio
+        second[i] = -2.0 * log - 4.0 * ratio + ratio * ratio
+    return value, first, second
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,12 +138,7 @@ class Touching:
     force: Array
     slope: Array
     normals: Array
-    bend: Callable[[], Array]
-
-    @cached_property
-    def curvatures(self) -> Array:
-        """Computed where they are asked for."""
-        return self.bend()
+    curvatures: Array
 
     def matrices(self, project: bool = False) -> Array:
         """Second derivatives (n, 3, 3) of the energies, N/m.
@@ -149,7 +152,7 @@ class Touching:
 
 _NOTHING = Touching(
     np.zeros(0, dtype=np.int64), 0.0, np.zeros(0), np.zeros(0), np.zeros((0, 3)),
-    lambda: np.zeros((0, 3, 3)),
+    np.zeros((0, 3, 3)),
 )  # fmt: skip
 
 
@@ -222,8 +225,7 @@ class Contact:
 
     def at(self, nodal: Array) -> Array:
         """Values at the points (n, 3) of a nodal field or configuration."""
-        nodes = self.points.operator.shape[1]
-        return np.asarray(self.points.operator @ nodal[:nodes])
+        return sparse_times(self.points.operator, nodal)
 
     def gaps(self, nodal: Array, time: float) -> Array:
         """Of each obstacle and point, (obstacles, n), m."""
@@ -244,11 +246,10 @@ class Contact:
                 continue
             areas = self.points.areas[points]
             value, first, second = barrier(gaps[points] / D)
-            normals = obstacle.normals(x[points], time)
+            normals, curvatures = obstacle.derivatives(x[points], time)
             force, slope = -k * areas * first, k / D * areas * second
             energy = float(k * D * (areas @ value))
-            bend = partial(obstacle.curvatures, x[points], time)
-            out.append(Touching(points, energy, force, slope, normals, bend))
+            out.append(Touching(points, energy, force, slope, normals, curvatures))
         return out
 
     def longest_step(self, x: Array, way: Array, time: float) -> float:
@@ -258,15 +259,46 @@ class Contact:
     def spread(self, values: Array, unknowns: int) -> Array:
         """Values (n, 3) at the points as nodal ones, on configurations (unknowns, 3)."""
         out = np.zeros((unknowns, 3))
-        out[: self._transposed.shape[0]] = self._transposed @ values
+        out[: self._transposed.shape[0]] = sparse_times(self._transposed, values)
         return out
+
+    def add_product(self, points: Index, matrices: Array, x: Array, out: Array) -> None:
+        """Add to ``out`` matrices (m, 3, 3) of some points times x, both on configurations."""
+        A = self.points.operator
+        _add_product(A.indptr, A.indices, A.data, points, matrices, x, out)
 
     def add_to(self, blocks: Array, matrices: Array, points: Index) -> None:
         """Add matrices (m, 3, 3) of some points to those of their cells, (C, L, L, 3, 3)."""
-        if not len(points):
-            return
-        local, width = self.points.local[points], self.points.local.shape[1]
-        more = np.einsum("pk,pl,pij->pklij", local, local, matrices, optimize=True)
-        cells = self.points.cells[points]  # in order
-        first = np.flatnonzero(np.diff(cells, prepend=-1))
-        blocks[cells[first], :width, :width] += np.add.reduceat(more, first)
+        _add_blocks(self.points.cells, self.points.local, points, matrices, blocks)
+
+
+@njit(**OPTIONS)
+def _add_product(starts, nodes, shares, points, matrices, x, out):  # type: ignore[no-untyped-def]
+    """Add A^T H A x for A in compressed rows, of which ``points`` have an H."""
+    at = np.empty(3)
+    for m in range(len(points)):
+        row = range(starts[points[m]], starts[points[m] + 1])
+        at[:] = 0.0
+        for k in row:
+            for i in range(3):
+                at[i] += shares[k] * x[nodes[k], i]
+        for i in range(3):
+            image = 0.0
+            for j in range(3):
+                image += matrices[m, i, j] * at[j]
+            for k in row:
+                out[nodes[k], i] += shares[k] * image
+
+
+@njit(**OPTIONS)
+def _add_blocks(cells, local, points, matrices, blocks):  # type: ignore[no-untyped-def]
+    """Add A^T H A to the matrices of the cells."""
+    for m in range(len(points)):
+        block, shares = blocks[cells[points[m]]], local[points[m]]
+        for k in range(len(shares)):
+            for l in range(len(shares)):
+                both = shares[k] * shares[l]
+                if both != 0.0:
+                    for i in range(3):
+                        for j in range(3):
+                            block[k, l, i, j] += both * matrices[m, i, j]

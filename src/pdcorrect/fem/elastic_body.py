@@ -184,7 +184,7 @@ class ElasticBody:
         Those of absurd or infinite deformations mean nothing: such a step fails by name.
         """
         u = positions[: len(self.positions)] - self.positions
-        mean = np.einsum("cki,ckj->cij", u[self.cells], self._mean_gradients, optimize=True)
+        mean = np.swapaxes(u[self.cells], 1, 2) @ self._mean_gradients
         return nearest_rotation(np.eye(3) + np.clip(np.nan_to_num(mean), -_LARGEST, _LARGEST))
 
     @cached_property

@@ -11,12 +11,14 @@ fibres of length r, as projective dynamics wants it: A^T w V A belongs to the gl
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import ClassVar
 
 import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
+from pdcorrect.fem.assembly import sparse_times
 from pdcorrect.fem.clamps import Selector
 from pdcorrect.fem.elastic_body import ElasticBody
 from pdcorrect.scene import Actuator
@@ -83,9 +85,13 @@ class Fibres:
             np.concatenate(rest), np.concatenate(weights), stretching, owner_cells, gradient,
         )  # fmt: skip
 
+    @cached_property
+    def _transposed(self) -> sp.csr_matrix:
+        return self.stretching.T.tocsr()
+
     def activations(self, time: float) -> Array:
         """R of each actuator at a time (s)."""
-        return np.array([np.interp(time, *table.T) for table in self.tables])
+        return np.array([np.interp(time, table[:, 0], table[:, 1]) for table in self.tables])
 
     def shares(self, time: float) -> tuple[Array, ...]:
         """Derivatives of each actuator's r at a time (s) by the stretches of its table, (rows,)."""
@@ -96,7 +102,7 @@ class Fibres:
 
     def stretched(self, u: Array) -> tuple[Array, Array]:
         """Length l (P,) and direction (P, 3) of fibres for displacements u (N, 3), m."""
-        fibres = self.rest + self.stretching @ u
+        fibres = self.rest + sparse_times(self.stretching, u)
         length = np.linalg.norm(fibres, axis=1)
         return length, fibres / np.maximum(length, _SHORTEST)[:, None]
 
@@ -105,15 +111,14 @@ class Fibres:
         excess = self.stretched(u)[0] - self.activations(time)[self.owners]
         return np.asarray(self.weights * excess)
 
-    def energy(self, u: Array, time: float) -> float:
-        """J."""
-        tensions = self.tensions(u, time)
-        return float(0.5 * (tensions / self.weights) @ tensions)
-
-    def forces(self, u: Array, time: float) -> Array:
-        """Of the fibres on the nodes, (N, 3), N."""
-        _, along = self.stretched(u)
-        return np.asarray(-(self.stretching.T @ (self.tensions(u, time)[:, None] * along)))
+    def energy_and_forces(self, u: Array, time: float) -> tuple[float, Array]:
+        """J, and of the fibres on the nodes, (N, 3), N."""
+        length, along = self.stretched(u)
+        excess = length - self.activations(time)[self.owners]
+        tensions = self.weights * excess
+        return 0.5 * float(excess @ tensions), -sparse_times(
+            self._transposed, tensions[:, None] * along
+        )
 
     def matrices(self, u: Array, time: float, project: bool = False) -> Array:
         """Second derivatives of the energy by F m, (P, 3, 3), J.
@@ -158,8 +163,10 @@ class Fibres:
     def blocks(self, matrices: Array) -> Array:
         """A^T H A by cell, (c, K, K, 3, 3), N/m, for H (P, 3, 3), J, in the order of ``cells``."""
         A = self.gradients
-        H = matrices.reshape(*A.shape[:2], 3, 3)
-        return np.asarray(np.einsum("cqk,cqij,cql->cklij", A, H, A, optimize=True))
+        cells, points, nodes = A.shape
+        H = matrices.reshape(cells, points, 1, 3, 3)
+        weighted = (A[..., None, None] * H).reshape(cells, points, -1)
+        return np.asarray(np.swapaxes(A, 1, 2) @ weighted).reshape(cells, nodes, nodes, 3, 3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,9 +178,10 @@ class FibreTangent:
 
     def apply(self, x: Array) -> Array:
         """Times x (N + B, 3)."""
-        A, out = self.fibres.stretching, np.zeros_like(x)
-        nodes = A.shape[1]
-        out[:nodes] = A.T @ np.einsum("pij,pj->pi", self.matrices, A @ x[:nodes])
+        out, changes = np.zeros_like(x), sparse_times(self.fibres.stretching, x)
+        tensions = np.einsum("pij,pj->pi", self.matrices, changes)
+        forces = sparse_times(self.fibres._transposed, tensions)
+        out[: len(forces)] = forces
         return out
 
     def add_to(self, blocks: Array) -> None:

@@ -322,3 +322,14 @@ def add_blocks(target, blocks, data):  # type: ignore[no-untyped-def]
         for a in range(3):
             for b in range(3):
                 data[target[i], a, b] += blocks[i, a, b]
+
+
+@njit(**OPTIONS)
+def sparse_times(starts, columns, entries, x):  # type: ignore[no-untyped-def]
+    """A matrix in compressed rows times x (n, 3)."""
+    out = np.zeros((len(starts) - 1, 3))
+    for row in range(len(out)):
+        for k in range(starts[row], starts[row + 1]):
+            for i in range(3):
+                out[row, i] += entries[k] * x[columns[k], i]
+    return out

@@ -28,13 +28,14 @@ class NotPositiveDefinite(ArithmeticError):
 class Solution:
     """The last iterate, whether the tolerance was met, and the number of products.
 
-    ``convex`` is False where a direction of negative curvature ended the iteration.
+    ``convex`` is False where a direction of negative curvature, ``downhill``, ended the iteration.
     """
 
     x: Array
     converged: bool
     convex: bool
     steps: int
+    downhill: Array | None = None
 
 
 def conjugate_gradients(
@@ -76,7 +77,7 @@ def conjugate_gradients(
         image = product(direction)
         curvature = float(np.vdot(direction, image))
         if not curvature > 0.0:
-            return Solution(x if step > 1 else z, False, False, step)
+            return Solution(x if step > 1 else z, False, False, step, direction)
         alpha = r_z / curvature
         change = alpha * direction
         x = x + change

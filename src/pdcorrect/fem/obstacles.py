@@ -13,13 +13,14 @@ coordinates, and each of these is one interval of the path.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Protocol
+import math
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from pdcorrect.fem.clamps import Course
+from pdcorrect.fem.decomposition import OPTIONS
 from pdcorrect.scene.obstacles import Box, Cylinder, Obstacle, Plane, Sphere
 from pdcorrect.scene.regions import unit_vector
 
@@ -28,89 +29,138 @@ Array = NDArray[np.float64]
 _REST = np.eye(3), np.zeros(3)
 _SHORT = 1e-6
 """Time over which velocities are means, s."""
+_HALF_SPACE, _SLAB, _RADIAL = 0.0, 1.0, 2.0
+"""Kinds of coordinates of points X: with a centre c, an axis a and a size s
+
+    a . (X - c) - s,    |a . (X - c)| - s,    |X - c - a . (X - c) a| - s.
+
+Balls are radial, of axis 0.
+"""
+_KIND, _CENTRE, _AXIS, _SIZE = 0, 1, 4, 7
+"""Columns of a table of coordinates, one a row."""
 
 
-class _Coordinate(Protocol):
-    """One q, over points X (n, 3) of the obstacle at rest."""
-
-    def value(self, X: Array) -> Array:
-        """(n,), m."""
-
-    def slope(self, X: Array) -> Array:
-        """First derivative, (n, 3) or (3,)."""
-
-    def curvature(self, X: Array) -> Array | float:
-        """Second derivative, (n, 3, 3) or 0."""
-
-    def interval(self, X: Array, way: Array) -> tuple[Array, Array]:
-        """The shares of paths X + share way between which q < 0, (n,) each; inf, -inf for none."""
+@njit(**OPTIONS)
+def _local(x, R, b, X):  # type: ignore[no-untyped-def]
+    """Fill X (3,) with R^T (x - b)."""
+    for i in range(3):
+        X[i] = R[0, i] * (x[0] - b[0]) + R[1, i] * (x[1] - b[1]) + R[2, i] * (x[2] - b[2])
 
 
-@dataclass(frozen=True, eq=False)
-class _Slab:
-    """|a . (X - c)| - half, or without ``half`` a . (X - c)."""
-
-    centre: Array
-    axis: Array
-    half: float | None = None
-
-    def value(self, X: Array) -> Array:
-        along = (X - self.centre) @ self.axis
-        return along if self.half is None else np.abs(along) - self.half
-
-    def slope(self, X: Array) -> Array:
-        if self.half is None:
-            return self.axis
-        return np.sign((X - self.centre) @ self.axis)[:, None] * self.axis
-
-    def curvature(self, X: Array) -> float:
-        return 0.0
-
-    def interval(self, X: Array, way: Array) -> tuple[Array, Array]:
-        along, speed = (X - self.centre) @ self.axis, way @ self.axis
-        low = np.full(len(X), -np.inf) if self.half is None else np.full(len(X), -self.half)
-        high = 0.0 if self.half is None else self.half
-        still = speed == 0.0
-        safe = np.where(still, 1.0, speed)
-        one, other = (low - along) / safe, (high - along) / safe
-        inside = (along > low) & (along < high)
-        first = np.where(still, np.where(inside, -np.inf, np.inf), np.minimum(one, other))
-        last = np.where(still, np.where(inside, np.inf, -np.inf), np.maximum(one, other))
-        return first, last
+@njit(**OPTIONS)
+def _coordinate(row, X, g):  # type: ignore[no-untyped-def]
+    """Q of a row at X (3,), and 1 over the radius of its level set; its derivative into g (3,)."""
+    along = 0.0
+    for i in range(3):
+        along += row[_AXIS + i] * (X[i] - row[_CENTRE + i])
+    if row[_KIND] != _RADIAL:
+        both = row[_KIND] == _SLAB and along < 0.0
+        for i in range(3):
+            g[i] = -row[_AXIS + i] if both else row[_AXIS + i]
+        return (-along if both else along) - row[_SIZE], 0.0
+    square = 0.0
+    for i in range(3):
+        g[i] = X[i] - row[_CENTRE + i] - along * row[_AXIS + i]
+        square += g[i] * g[i]
+    length = math.sqrt(square)
+    bend = 1.0 / max(length, 1e-300)
+    for i in range(3):
+        g[i] *= bend
+    return length - row[_SIZE], bend
 
 
-@dataclass(frozen=True, eq=False)
-class _Radial:
-    """|P (X - c)| - r with a projection P (3, 3)."""
+@njit(**OPTIONS)
+def _interval(row, X, way):  # type: ignore[no-untyped-def]
+    """The shares of the path X + share way between which q < 0; inf, -inf for none."""
+    along, speed = 0.0, 0.0
+    for i in range(3):
+        along += row[_AXIS + i] * (X[i] - row[_CENTRE + i])
+        speed += row[_AXIS + i] * way[i]
+    if row[_KIND] != _RADIAL:
+        low, high = -row[_SIZE] if row[_KIND] == _SLAB else -math.inf, row[_SIZE]
+        if speed == 0.0:
+            inside = low < along < high
+            return (-math.inf, math.inf) if inside else (math.inf, -math.inf)
+        one, other = (low - along) / speed, (high - along) / speed
+        return min(one, other), max(one, other)
+    a, b, c = 0.0, 0.0, -(row[_SIZE] ** 2)
+    for i in range(3):
+        arm, step = (
+            X[i] - row[_CENTRE + i] - along * row[_AXIS + i],
+            way[i] - speed * row[_AXIS + i],
+        )
+        a, b, c = a + step * step, b + arm * step, c + arm * arm
+    if a == 0.0:
+        return (-math.inf, math.inf) if c < 0.0 else (math.inf, -math.inf)
+    if not b * b > a * c:
+        return math.inf, -math.inf
+    root = math.sqrt(b * b - a * c)
+    return (-b - root) / a, (-b + root) / a
 
-    centre: Array
-    projection: Array
-    radius: float
 
-    def value(self, X: Array) -> Array:
-        return np.linalg.norm((X - self.centre) @ self.projection, axis=1) - self.radius
+@njit(**OPTIONS)
+def _gaps(table, R, b, x):  # type: ignore[no-untyped-def]
+    """Signed distances of points x (n, 3), (n,)."""
+    X, g, out = np.empty(3), np.empty(3), np.empty(len(x))
+    for n in range(len(x)):
+        _local(x[n], R, b, X)
+        square, largest = 0.0, -math.inf
+        for row in table:
+            q, _ = _coordinate(row, X, g)
+            square += max(q, 0.0) ** 2
+            largest = max(largest, q)
+        out[n] = math.sqrt(square) if square > 0.0 else largest
+    return out
 
-    def slope(self, X: Array) -> Array:
-        arm = (X - self.centre) @ self.projection
-        length = np.linalg.norm(arm, axis=1)[:, None]
-        return np.divide(arm, length, out=np.zeros_like(arm), where=length > 0.0)
 
-    def curvature(self, X: Array) -> Array:
-        first, length = self.slope(X), self.value(X) + self.radius
-        second = self.projection - first[:, :, None] * first[:, None, :]
-        return np.asarray(second / np.maximum(length, 1e-300)[:, None, None])
+@njit(**OPTIONS)
+def _derivatives(table, R, b, x):  # type: ignore[no-untyped-def]
+    """First (n, 3) and second (n, 3, 3) derivatives of the gaps of points x (n, 3) outside."""
+    X, g, n, H = np.empty(3), np.empty(3), np.empty(3), np.empty((3, 3))
+    first, second = np.empty((len(x), 3)), np.empty((len(x), 3, 3))
+    for p in range(len(x)):
+        _local(x[p], R, b, X)
+        n[:] = 0.0
+        H[:] = 0.0
+        square, several = 0.0, len(table) > 1
+        for row in table:
+            q, bend = _coordinate(row, X, g)
+            if not q > 0.0:
+                continue
+            square += q * q
+            for i in range(3):
+                n[i] += q * g[i]
+                for j in range(3):
+                    across = (
+                        (1.0 if i == j else 0.0) - row[_AXIS + i] * row[_AXIS + j] - g[i] * g[j]
+                    )
+                    H[i, j] += q * bend * across + (g[i] * g[j] if several else 0.0)
+        d = math.sqrt(square) if square > 0.0 else math.nan
+        n /= d
+        H /= d
+        if several:
+            for i in range(3):
+                for j in range(3):
+                    H[i, j] -= n[i] * n[j] / d
+        first[p] = R @ n
+        second[p] = R @ H @ R.T
+    return first, second
 
-    def interval(self, X: Array, way: Array) -> tuple[Array, Array]:
-        arm, speed = (X - self.centre) @ self.projection, way @ self.projection
-        a, b = (speed**2).sum(axis=1), (arm * speed).sum(axis=1)
-        c = (arm**2).sum(axis=1) - self.radius**2
-        root = np.sqrt(np.maximum(b * b - a * c, 0.0))
-        meets, still = b * b > a * c, a == 0.0
-        safe = np.where(still, 1.0, a)
-        first = np.where(meets, (-b - root) / safe, np.inf)
-        last = np.where(meets, (-b + root) / safe, -np.inf)
-        first = np.where(still, np.where(c < 0.0, -np.inf, np.inf), first)
-        return first, np.where(still, np.where(c < 0.0, np.inf, -np.inf), last)
+
+@njit(**OPTIONS)
+def _first_hit(table, R, b, x, way):  # type: ignore[no-untyped-def]
+    """The smallest share of the paths x + share way (n, 3) at which a point enters, or infinity."""
+    X, W, least = np.empty(3), np.empty(3), math.inf
+    for n in range(len(x)):
+        _local(x[n], R, b, X)
+        _local(way[n], R, np.zeros(3), W)
+        first, last = -math.inf, math.inf
+        for row in table:
+            low, high = _interval(row, X, W)
+            first, last = max(first, low), min(last, high)
+        if first < last and last > 0.0 and 0.0 <= first < least:
+            least = first
+    return least
 
 
 class RigidObstacle:
@@ -126,7 +176,7 @@ class RigidObstacle:
     def __init__(self, declared: Obstacle, recess: float = 0.0) -> None:
         self.declared = declared
         self._course = None if declared.motion is None else Course(declared.motion)
-        self._coordinates = _coordinates(declared, recess)
+        self._table = _coordinates(declared, recess)
         self._last: tuple[float, tuple[Array, Array]] | None = None  # steps ask again and again
 
     @property
@@ -154,48 +204,19 @@ class RigidObstacle:
 
     def gaps(self, x: Array, time: float) -> Array:
         """Distances of points (n, 3) from the surface, (n,), m; negative inside."""
-        q = self._values(self._local(x, time))
-        if len(q) == 1:
-            return np.asarray(q[0])
-        outside = np.sqrt((np.maximum(q, 0.0) ** 2).sum(axis=0))
-        return np.where(outside > 0.0, outside, q.max(axis=0))
+        return np.asarray(_gaps(self._table, *self.frame(time), x))
 
-    def normals(self, x: Array, time: float) -> Array:
-        """First derivatives (n, 3) of the gaps of points outside."""
-        X = self._local(x, time)
-        shares, _ = self._shares(X)
-        n = np.zeros_like(X)
-        for share, coordinate in zip(shares, self._coordinates, strict=True):
-            n += share[:, None] * coordinate.slope(X)
-        return n if self._course is None else n @ self.frame(time)[0].T
+    def derivatives(self, x: Array, time: float) -> tuple[Array, Array]:
+        """First (n, 3) and second (n, 3, 3) derivatives of the gaps of points outside.
 
-    def curvatures(self, x: Array, time: float) -> Array:
-        """Second derivatives (n, 3, 3) of the gaps of points outside."""
-        X = self._local(x, time)
-        shares, d = self._shares(X)
-        n, H = np.zeros_like(X), np.zeros((*X.shape, 3))
-        for share, coordinate in zip(shares, self._coordinates, strict=True):
-            H += share[:, None, None] * coordinate.curvature(X)
-            if len(shares) > 1:
-                g = np.broadcast_to(coordinate.slope(X), X.shape)
-                n += share[:, None] * g
-                counted = ((share > 0.0) / d)[:, None, None]
-                H += counted * g[:, :, None] * g[:, None, :]
-        if len(shares) > 1:
-            H -= n[:, :, None] * n[:, None, :] / d[:, None, None]
-        R = self.frame(time)[0]
-        return H if self._course is None else R @ H @ R.T
+        Not numbers inside.
+        """
+        first, second = _derivatives(self._table, *self.frame(time), x)
+        return first, second
 
     def first_hit(self, x: Array, way: Array, time: float) -> float:
         """The share of the paths x + share way at which a point enters; infinite if none does."""
-        X, (R, _) = self._local(x, time), self.frame(time)
-        way = way @ R
-        first, last = np.full(len(X), -np.inf), np.full(len(X), np.inf)
-        for coordinate in self._coordinates:
-            low, high = coordinate.interval(X, way)
-            first, last = np.maximum(first, low), np.minimum(last, high)
-        hit = (first < last) & (last > 0.0) & (first >= 0.0)
-        return float(first[hit].min(initial=np.inf))
+        return float(_first_hit(self._table, *self.frame(time), x, way))
 
     def carried(self, x: Array, start: float, end: float) -> Array:
         """Where points (n, 3) fixed to the obstacle at ``start`` (s) are at ``end``."""
@@ -212,16 +233,6 @@ class RigidObstacle:
         """The rotation (3, 3) from one time to another, s."""
         return self.frame(end)[0] @ self.frame(start)[0].T
 
-    def _shares(self, X: Array) -> tuple[Array, Array]:
-        """q+ / d of each coordinate, and d, of points at X; not a number inside."""
-        shares = np.maximum(self._values(X), 0.0)
-        d = np.sqrt((shares**2).sum(axis=0))
-        d[d == 0.0] = np.nan
-        return shares / d, d
-
-    def _values(self, X: Array) -> Array:
-        return np.stack([coordinate.value(X) for coordinate in self._coordinates])
-
     def _local(self, x: Array, time: float) -> Array:
         if self._course is None:
             return x
@@ -229,21 +240,19 @@ class RigidObstacle:
         return (x - b) @ R
 
 
-def _coordinates(declared: Obstacle, less: float) -> list[_Coordinate]:
-    """Those of a shape whose surface is moved in by ``less``."""
+def _coordinates(declared: Obstacle, less: float) -> Array:
+    """The table of coordinates of a shape whose surface is moved in by ``less``."""
     if isinstance(declared, Plane):
-        normal = unit_vector(declared.normal)
-        return [_Slab(np.array(declared.point) - less * normal, normal)]
+        return np.array([[_HALF_SPACE, *declared.point, *unit_vector(declared.normal), -less]])
     if isinstance(declared, Box):
         low, high = np.array(declared.box)
         centre, half = 0.5 * (low + high), 0.5 * (high - low) - less
-        return [_Slab(centre, axis, h) for axis, h in zip(np.eye(3), half, strict=True)]
-    centre = np.array(declared.centre)
+        return np.array([[_SLAB, *centre, *a, h] for a, h in zip(np.eye(3), half, strict=True)])
     if isinstance(declared, Sphere):
-        return [_Radial(centre, np.eye(3), declared.radius - less)]
+        return np.array([[_RADIAL, *declared.centre, 0.0, 0.0, 0.0, declared.radius - less]])
     assert isinstance(declared, Cylinder)
     axis = unit_vector(declared.axis)
-    side = _Radial(centre, np.eye(3) - np.outer(axis, axis), declared.radius - less)
+    side = [_RADIAL, *declared.centre, *axis, declared.radius - less]
     if declared.length is None:
-        return [side]
-    return [side, _Slab(centre, axis, 0.5 * declared.length - less)]
+        return np.array([side])
+    return np.array([side, [_SLAB, *declared.centre, *axis, 0.5 * declared.length - less]])

@@ -67,16 +67,12 @@ class Rollers:
             oblique, clamps.rest, clamps.free, nodes, normals, _STIFFER * own, cells, corners
         )
 
-    def energy(self, u: Array, time: float) -> float:
-        """J, for displacements u (N, 3), m."""
-        return float(0.5 * self.stiffness @ self._gaps(u, time) ** 2)
-
-    def forces(self, u: Array, time: float) -> Array:
-        """Of the springs on the nodes, (N, 3), N."""
-        out = np.zeros_like(self.rest)
-        pull = -self.stiffness * self._gaps(u, time)
+    def energy_and_forces(self, u: Array, time: float) -> tuple[float, Array]:
+        """J, and of the springs on the nodes, (N, 3), N, for displacements u (N, 3), m."""
+        out, gaps = np.zeros_like(self.rest), self._gaps(u, time)
+        pull = -self.stiffness * gaps
         np.add.at(out, self.nodes, pull[:, None] * self.normals)
-        return out
+        return -0.5 * float(pull @ gaps), out
 
     def tangent(self, u: Array, time: float, project: bool = False, factor: float = 1.0) -> Rollers:
         """The second derivative times a factor."""

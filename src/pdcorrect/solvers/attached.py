@@ -43,8 +43,9 @@ class AttachedTerm:
         factor = self._stage.load_factor
         for part, place, time in self._acting(y):
             share = factor if part.at_end else 1.0
-            value += share / (self._stage.gain if part.at_end else 1.0) * part.energy(place, time)
-            out[:nodes] -= share * part.forces(place, time)
+            energy, forces = part.energy_and_forces(place, time)
+            value += share / (self._stage.gain if part.at_end else 1.0) * energy
+            out[:nodes] -= share * forces
         return value, out
 
     def end_forces(self, y: Array) -> Array:
@@ -52,7 +53,7 @@ class AttachedTerm:
         out = np.zeros_like(self._rest)
         for part, place, time in self._acting(y):
             if part.at_end:
-                out += self._stage.load_factor * part.forces(place, time)
+                out += self._stage.load_factor * part.energy_and_forces(place, time)[1]
         return out
 
     def end_slopes(self, y: Array, z: Array) -> Array:

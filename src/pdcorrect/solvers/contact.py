@@ -6,16 +6,24 @@ obstacle: with g = dp'/dy the terms are B(p')/g and D(p')/g, whose forces are th
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from pdcorrect.fem.contact import Contact, Touching
+from pdcorrect.fem.decomposition import OPTIONS
 from pdcorrect.solvers.integrators import StepEquation
 from pdcorrect.state import State
 
 Array = NDArray[np.float64]
+
+_OF_GAP = 1e-3
+"""Of the smallest gap: length up to which Newton steps are trusted."""
+_CLEAR = 1e-6
+"""Of an obstacle's distance: least gap to begin with; Newton's steps only double smaller ones."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,34 +51,21 @@ class Sliding:
         """Beyond the obstacle's, of its points (m, 3) of all at x (n, 3)."""
         return np.asarray(x[self.points] - self.carried[self.points])
 
-    def value(self, u: Array) -> float:
-        """The potential, J, of motions (m, 3) beyond the obstacle's."""
-        size, e = self._length(u), self.slip
-        inner = np.minimum(size, e)
-        f = inner**2 / e * (1.0 - inner / (3.0 * e)) + np.maximum(size - e, 0.0)
-        return float(self.most @ f)
-
-    def forces(self, u: Array) -> Array:
-        """Of friction on the points, (m, 3), N."""
-        size = self._length(u)
-        return -(self.most * self._over_length(size))[:, None] * self._tangent(u)
+    def value_and_forces(self, u: Array) -> tuple[float, Array]:
+        """Of motions u (m, 3) beyond the obstacle's: J, and on the points, (m, 3), N."""
+        value, forces = _friction(self.most, self.touching.normals, self.slip, u)
+        return value, forces
 
     def matrices(self, u: Array) -> Array:
         """The second derivative, (m, 3, 3), N/m."""
-        size, tangent, e = self._length(u), self._tangent(u), self.slip
-        over = self._over_length(size)
-        unit = np.divide(tangent, size[:, None], out=np.zeros_like(u), where=size[:, None] > 0.0)
-        along = np.where(size < e, 2.0 / e - 2.0 * size / e**2, 0.0) - over
-        n = self.touching.normals
-        out = over[:, None, None] * (np.eye(3) - n[:, :, None] * n[:, None, :])
-        out += along[:, None, None] * unit[:, :, None] * unit[:, None, :]
-        return self.most[:, None, None] * out
+        return np.asarray(_friction_tangent(self.most, self.touching.normals, self.slip, u))
 
     def lagged_slopes(self, u: Array, z: Array) -> Array:
-        """Derivatives of z . `forces` by the places where force and plane are taken, (m, 3)."""
-        part, tangent, e = self.touching, self._tangent(u), self.slip
-        size, n = self._length(u), part.normals
-        over = self._over_length(size)
+        """Derivatives of z . forces by the places where force and plane are taken, (m, 3)."""
+        part, e, n = self.touching, self.slip, self.touching.normals
+        tangent = u - np.einsum("mi,mi->m", n, u)[:, None] * n
+        size = np.linalg.norm(tangent, axis=1)
+        over = np.where(size < e, 2.0 / e - size / e**2, 1.0 / np.maximum(size, e))  # f'(u)/u
         along = np.einsum("mi,mi->m", z, tangent)
         un, zn = (np.einsum("mi,mi->m", v, n)[:, None] for v in (u, z))
         bend = np.where(size < e, -1.0 / e**2, -1.0 / np.maximum(size, e) ** 2)
@@ -79,17 +74,44 @@ class Sliding:
         out = np.einsum("mij,mj->mi", part.curvatures, self.most[:, None] * by_normal)
         return out + (self.friction * over * along * part.slope)[:, None] * n
 
-    def _over_length(self, size: Array) -> Array:
-        """F'(u)/u."""
-        e = self.slip
-        return np.where(size < e, 2.0 / e - size / e**2, 1.0 / np.maximum(size, e))
 
-    def _tangent(self, u: Array) -> Array:
-        n = self.touching.normals
-        return u - np.einsum("mi,mi->m", n, u)[:, None] * n
+@njit(**OPTIONS)
+def _tangential(n, u, t):  # type: ignore[no-untyped-def]
+    """Fill t (3,) with the part of u across the unit vector n; its length."""
+    along = n[0] * u[0] + n[1] * u[1] + n[2] * u[2]
+    square = 0.0
+    for i in range(3):
+        t[i] = u[i] - along * n[i]
+        square += t[i] * t[i]
+    return math.sqrt(square)
 
-    def _length(self, u: Array) -> Array:
-        return np.linalg.norm(self._tangent(u), axis=1)
+
+@njit(**OPTIONS)
+def _friction(most, normals, e, u):  # type: ignore[no-untyped-def]
+    value, forces, t = 0.0, np.empty_like(u), np.empty(3)
+    for a in range(len(u)):
+        size = _tangential(normals[a], u[a], t)
+        inner = min(size, e)
+        f = inner * inner / e * (1.0 - inner / (3.0 * e)) + max(size - e, 0.0)
+        over = 2.0 / e - size / (e * e) if size < e else 1.0 / size
+        value += most[a] * f
+        for i in range(3):
+            forces[a, i] = -most[a] * over * t[i]
+    return value, forces
+
+
+@njit(**OPTIONS)
+def _friction_tangent(most, normals, e, u):  # type: ignore[no-untyped-def]
+    out, t = np.empty((len(u), 3, 3)), np.empty(3)
+    for a in range(len(u)):
+        n, size = normals[a], _tangential(normals[a], u[a], t)
+        over = 2.0 / e - size / (e * e) if size < e else 1.0 / size
+        bend = 0.0 if size == 0.0 else -1.0 / (e * e * size) if size < e else -1.0 / size**3
+        for i in range(3):
+            for j in range(3):
+                across = (1.0 if i == j else 0.0) - n[i] * n[j]
+                out[a, i, j] = most[a] * (over * across + bend * t[i] * t[j])
+    return out
 
 
 class ContactTerm:
@@ -149,7 +171,8 @@ class ContactTerm:
     def _reachable(self, nodal: Array) -> bool:
         """Whether nodes can be there at the end, and no obstacle has passed through the body."""
         contact, x = self._contact, self._contact.at(nodal)
-        return bool(contact.gaps_at(x, self._end).min() > 0.0) and all(
+        clear = contact.gaps_at(x, self._end) > _CLEAR * np.array(contact.distances)[:, None]
+        return bool(clear.all()) and all(
             not way.any() or obstacle.first_hit(carried, x - carried, self._end) > 1.0
             for obstacle, carried, way in zip(
                 contact.obstacles, self._carried, self._ways, strict=True
@@ -161,6 +184,14 @@ class ContactTerm:
         gaps = self._contact.gaps_at(self._points(y), self._end)
         return bool((gaps < np.array(self._contact.distances)[:, None]).any())
 
+    def trusted(self, y: Array) -> float:
+        """Length up to which a Newton step at y tells the distance from the minimum, m.
+
+        Far too near an obstacle such a step is about as long as the gap, however small that is.
+        """
+        gap = self._contact.gaps_at(self._points(y), self._end).min()
+        return _OF_GAP * float(gap) / self._stage.gain
+
     def value_and_gradient(self, y: Array) -> tuple[float, Array]:
         """J and N, (N + B, 3)."""
         x, value = self._points(y), 0.0
@@ -170,9 +201,9 @@ class ContactTerm:
             if np.isfinite(part.value):
                 forces[part.points] += part.force[:, None] * part.normals
         for sliding in self._sliding:
-            u = sliding.motions(x)
-            value += sliding.value(u)
-            forces[sliding.points] += sliding.forces(u)
+            loss, pull = sliding.value_and_forces(sliding.motions(x))
+            value += loss
+            forces[sliding.points] += pull
         factor = self._stage.load_factor
         forces = -factor * self._contact.spread(forces, len(y))
         return factor * value / self._stage.gain, forces
@@ -191,7 +222,7 @@ class ContactTerm:
             work += float(np.vdot(part.force[:, None] * part.normals, way[part.points]))
         for sliding, way in zip(self._sliding, self._ways, strict=False):
             u = sliding.motions(x)
-            forces = sliding.forces(u)
+            forces = sliding.value_and_forces(u)[1]
             work += float(np.vdot(forces, way[sliding.points]))
             loss -= float(np.vdot(forces, u))
         return {
@@ -240,7 +271,7 @@ class ContactTerm:
         out = np.zeros(len(self._contact.obstacles))
         for i, sliding in enumerate(self._sliding):
             if sliding.friction:
-                forces = sliding.forces(sliding.motions(x))
+                forces = sliding.value_and_forces(sliding.motions(x))[1]
                 out[i] = np.vdot(at[sliding.points], forces) / sliding.friction
         return self._stage.load_factor * out
 
@@ -281,11 +312,10 @@ class ContactTangent:
 
     def apply(self, x: Array) -> Array:
         """Times x (N + B, 3)."""
-        at = self.contact.at(x)
-        out = np.zeros_like(at)
+        out = np.zeros_like(x)
         for points, matrices in self.parts:
-            out[points] += np.einsum("mij,mj->mi", matrices, at[points])
-        return self.contact.spread(out, len(x))
+            self.contact.add_product(points, matrices, x, out)
+        return out
 
     def add_to(self, blocks: Array) -> None:
         """Add to the cells' matrices (C, L, L, 3, 3)."""

@@ -95,7 +95,7 @@ class Viscous:
         """J and N."""
         stretches = Stretches(self._problem, y)
         stress = self.stress(stretches)
-        value = 0.5 * float(product(self.change(stretches), stress).sum())
+        value = 0.5 * float(np.vdot(self.change(stretches), stress))
         force = stretches.forces(stress)
         if self.written is None:
             return value, force

@@ -42,14 +42,14 @@ class Anderson:
         return image - np.diff(np.stack(self._images, axis=1), axis=1) @ weights
 
 
-def settle(objective: StepObjective, minimise: Callable[[Array], Minimum]) -> Minimum:
-    """Minimise with loads that follow the body, and friction, as they are at the minimum.
+def settle(objective: StepObjective, start: Array, minimise: Callable[[Array], Minimum]) -> Minimum:
+    """Minimise from ``start`` with loads that follow the body, and friction, as at the minimum.
 
     ``minimise``, from a configuration on, takes no iteration where the remaining distance is
     within the tolerance.
     """
     accelerate = Anderson()
-    y = objective.start
+    y = start
     found = minimise(y)
     for _ in range(MOST):
         if not found.status.ok:

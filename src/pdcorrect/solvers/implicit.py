@@ -6,7 +6,7 @@ import os
 import threading
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import cache
 from numbers import Real
@@ -19,12 +19,18 @@ from threadpoolctl import ThreadpoolController
 
 from pdcorrect.errors import InputError
 from pdcorrect.fem.clamps import check_held
-from pdcorrect.fem.factorisation import Backend, check_backend
+from pdcorrect.fem.factorisation import Backend, NotPositiveDefinite, check_backend
 from pdcorrect.fem.problem import Problem
 from pdcorrect.solvers.follower import settle
 from pdcorrect.solvers.integrators import Integrator, backward_euler
 from pdcorrect.solvers.integrators import integrator as make_integrator
-from pdcorrect.solvers.minimise import MinimiserOptions, Minimum, Solve, newton_cg
+from pdcorrect.solvers.minimise import (
+    MinimiserOptions,
+    Minimum,
+    Solve,
+    below_saddle,
+    newton_cg,
+)
 from pdcorrect.solvers.reactions import contact_forces
 from pdcorrect.solvers.schemes import WHOLE_MEMORY
 from pdcorrect.solvers.step import (
@@ -39,6 +45,8 @@ Array = NDArray[np.float64]
 
 _FALLBACK_ITERATIONS = 60
 _SUBSTEP_LEVELS = 4
+_SADDLES = 5
+"""That a step leaves, at most."""
 _OF_DISTANCE = 2e-5
 """Of an obstacle's distance: largest tolerance, as contact forces change fast within it."""
 _SLACK = 0.5
@@ -84,6 +92,8 @@ class ImplicitStepper:
     """
 
     name = "implicit"
+    _sees_saddles = False
+    """Whether convergence means that the Hessian is positive definite."""
 
     def __init__(
         self,
@@ -259,21 +269,45 @@ class ImplicitStepper:
         objective = self.objective(state, forces, h, integrate)
         stage = objective.stage
         options = replace(self._options, tolerance=self._options.tolerance / stage.gain)
-        if objective.follows:
-            options = replace(options, tolerance=0.5 * options.tolerance)
-            again = replace(options, unmoved=1.0)
-            minimum = settle(
-                objective,
-                lambda y: self._solved(objective, y, options if y is objective.start else again),
-            )
-        else:
-            minimum = self._solved(objective, objective.start, options)
+        minimum = self._settled(objective, objective.start, options)
+        for _ in range(_SADDLES):
+            below = self._below_saddle(objective, minimum)
+            if below is None:
+                break
+            minimum = self._settled(objective, below, options).after(minimum)
         effort.update(iterations=minimum.iterations, evaluations=minimum.evaluations)
         if minimum.status.ok and self._adrift:
             y, gradient = objective.carried(minimum.positions, minimum.gradient)
             minimum = replace(minimum, positions=y, gradient=gradient)
         minimum.estimate *= stage.gain
         return _outcome(self.problem, state, objective, minimum, h)
+
+    def _settled(
+        self, objective: StepObjective, start: Array, options: MinimiserOptions
+    ) -> Minimum:
+        """`_solved`, with friction and loads that follow the body as at the minimum."""
+        if not objective.follows:
+            return self._solved(objective, start, options)
+        options = replace(options, tolerance=0.5 * options.tolerance)
+        again = replace(options, unmoved=1.0)
+        return settle(
+            objective,
+            start,
+            lambda y: self._solved(objective, y, options if y is start else again),
+        )
+
+    def _below_saddle(self, objective: StepObjective, minimum: Minimum) -> Array | None:
+        """See `below_saddle`; None too where the loop has looked itself, or contact does not press.
+
+        Symmetric bodies that obstacles squeeze buckle.
+        """
+        y, status = minimum.positions, minimum.status
+        pressed = objective.contact is not None and objective.contact.near(y)
+        seen = self._sees_saddles and status is Status.CONVERGED
+        if status is Status.LINE_SEARCH or (status.ok and pressed and not seen):
+            with suppress(NotPositiveDefinite):
+                return below_saddle(objective, y, self.preconditioner(objective, y))
+        return None
 
     def _solved(self, objective: StepObjective, start: Array, options: MinimiserOptions) -> Minimum:
         """The method itself, then Newton-CG from where it stopped."""
@@ -321,7 +355,9 @@ class ImplicitStepper:
         if self.problem.contact is not None:
             loads = loads + contact_forces(self.problem, end, before).sum(axis=0)
         if self.problem.rollers is not None:
-            loads += self.problem.rollers.forces(end.positions - self.problem.positions, end.time)
+            loads += self.problem.rollers.energy_and_forces(
+                end.positions - self.problem.positions, end.time
+            )[1]
         internal = self.problem.mass_times(accelerations) - loads
         known = {
             "accelerations": accelerations,
@@ -372,7 +408,8 @@ def _outcome(
         reaction = pushed - rollers.along(pushed * problem.free)
     ends_at_y = stage.gain == 1.0  # otherwise the modes at the end are other ones
     end = y if ends_at_y else problem.relaxed(after.positions)
-    attached = [one.energy(end[:nodes] - problem.positions, stage.end) for one in problem.attached]
+    u = end[:nodes] - problem.positions
+    attached = [one.energy_and_forces(u, stage.end)[0] for one in problem.attached]
     momentum = problem.mass_times(after.velocities)
     stats = {
         "elastic_energy": problem.energy_and_forces(end)[0] + sum(attached),

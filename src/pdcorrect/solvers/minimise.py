@@ -32,6 +32,10 @@ _ROUND_OFF = 1e-13
 """Relative to the terms of gamma: changes below this carry no information."""
 BACKTRACKS = 30
 _ESTIMATE_STEPS, _INNER_STEPS = 1000, 400
+_PROBE = 1e-3
+"""Of the residual of a right-hand side with all modes in it: no negative curvature is met later."""
+_ASIDE = 1e-8
+"""Of the terms of gamma: how far it should fall in the first step from a saddle."""
 NO_MOTION = 1e-6
 """Of the tolerance: above this an unmoved first iterate is improved once before it is accepted.
 
@@ -47,10 +51,12 @@ The estimate is usually 3 to 10 times that length.
 class Objective(Protocol):
     """What the loop minimises, over arrays (N, 3).
 
-    ``scale`` is the size of the terms that the last value was summed from.
+    ``scale`` is the size of the terms that the last value was summed from, ``free`` (N, 3) says
+    what is not prescribed.
     """
 
     scale: float
+    free: NDArray[np.bool_]
 
     def value_and_gradient(self, p: Array) -> tuple[float, Array]:
         """Value and gradient; the gradient is zero where p is prescribed."""
@@ -60,6 +66,9 @@ class Objective(Protocol):
 
     def longest_step(self, p: Array, direction: Array) -> float:
         """Share of a direction, at most 1, along which the function is finite."""
+
+    def trusted(self, p: Array) -> float:
+        """Length up to which a Newton step at p tells the distance from the minimum, m."""
 
 
 @dataclass(frozen=True)
@@ -212,11 +221,12 @@ def minimise(
         length = largest_displacement(direction)
         if length <= threshold:
             exact, estimate = newton_step(objective, p, gradient, solve, direction)
-            if estimate <= options.tolerance * (1.0 if iteration else options.unmoved):
+            within = min(options.tolerance, objective.trusted(p))
+            if estimate <= within * (1.0 if iteration else options.unmoved):
                 status = Status.CONVERGED
                 break
-            if estimate > options.tolerance:
-                threshold = length * max(0.05, min(0.5, 0.5 * options.tolerance / estimate))
+            if estimate > within:
+                threshold = length * max(0.05, min(0.5, 0.5 * within / estimate))
             if options.history and math.isfinite(estimate):
                 direction = exact
         if iteration == options.max_iterations:
@@ -303,6 +313,33 @@ def newton_step(
     return found.x, largest_displacement(found.x) if exact else math.inf
 
 
+def below_saddle(objective: Objective, p: Array, solve: Solve) -> Array | None:
+    """A configuration (N, 3) beside a stationary p where the function is less; None at a minimum.
+
+    `newton_step` does not see curvature across a symmetry of body and load, where the gradient is
+    zero.  Conjugate gradients on a fixed random right-hand side do.
+    """
+    b = np.random.default_rng(0).normal(size=p.shape) * objective.free
+    hessian = objective.hessian_operator(p)
+    way = conjugate_gradients(hessian, b, solve, tolerance=_PROBE, max_steps=_INNER_STEPS).downhill
+    if way is None:
+        return None
+    value, gradient = objective.value_and_gradient(p)
+    noise, bend = _ROUND_OFF * objective.scale, -float(np.vdot(way, hessian(way)))
+    if not bend > 0.0:
+        return None
+    way = way * math.copysign(
+        math.sqrt(2.0 * _ASIDE * objective.scale / bend), -np.vdot(gradient, way)
+    )
+    step = objective.longest_step(p, way)
+    for _ in range(BACKTRACKS):
+        trial = p + step * way
+        if objective.value_and_gradient(trial)[0] < value - noise:
+            return trial
+        step *= 0.5
+    return None
+
+
 Direction = Callable[[Array, Array], tuple[Array, bool]]
 """(p, gradient) -> (minus the Newton step, whether the exact, positive Hessian gave it)."""
 
@@ -324,8 +361,11 @@ def newton_loop(
             break
         step, exact = direction(p, gradient)
         estimate = largest_displacement(step) if exact else math.inf
-        if estimate <= options.tolerance:
+        if estimate <= options.tolerance and estimate <= objective.trusted(p):
             status = Status.CONVERGED
+            break
+        if not exact and largest_displacement(step) <= options.tolerance:
+            status = Status.LINE_SEARCH  # a saddle
             break
         if iteration == options.max_iterations:
             break

@@ -60,6 +60,7 @@ class Newton(ImplicitStepper):
     """
 
     name = "Newton"
+    _sees_saddles = True
 
     def __init__(
         self,

@@ -27,8 +27,8 @@ FirstHessian = Literal["auto", "G", "G-scaled", "rest", "lagged"]
 
 _PATIENCE = 40
 """Iterations with one true Hessian before it is renewed within the step."""
-_CONTACT_PATIENCE = 8
-"""The same where the surface touches an obstacle."""
+_CONTACT_PATIENCE = 5
+"""The same in scenes with obstacles, whose barriers no earlier Hessian knows."""
 VOLUME_SCALE = 0.25
 """Factor on the volume weight inside the first Hessian "G-scaled".
 
@@ -174,7 +174,7 @@ class ProjectiveDynamics(ImplicitStepper):
         most = options.max_iterations
         first = start is objective.start
         touching = objective.contact is not None and objective.contact.near(start)
-        patience = _CONTACT_PATIENCE if touching else _PATIENCE
+        patience = _PATIENCE if objective.contact is None else _CONTACT_PATIENCE
         if touching and (first or hessian.age != INSIDE):
             solver = hessian.renew(objective, start)
         else:

@@ -105,7 +105,7 @@ def contact_forces(problem: Problem, state: State, before: State | None = None) 
         else:
             carried = obstacle.carried(contact.at(before.positions), before.time, state.time)
         sliding = Sliding(contact.frictions[i], part, carried, contact.slips[i] * h)
-        forces[part.points] += sliding.forces(sliding.motions(x))
+        forces[part.points] += sliding.value_and_forces(sliding.motions(x))[1]
         out[i] = contact.spread(forces, len(state.positions))
     return out
 
@@ -121,7 +121,7 @@ def forces_at(problem: Problem, state: State, forces: Array | None = None) -> Ar
     if forces is not None:
         out += forces
     if problem.fibres is not None:
-        out += problem.fibres.forces(state.positions - problem.positions, state.time)
+        out += problem.fibres.energy_and_forces(state.positions - problem.positions, state.time)[1]
     if problem.contact is not None:
         out += contact_forces(problem, state).sum(axis=0)
     if damping.mass:

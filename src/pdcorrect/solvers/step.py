@@ -10,6 +10,7 @@ potential: f is theirs at a y that `StepObjective.follow` is told.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -204,6 +205,10 @@ class StepObjective:
     def longest_step(self, y: Array, direction: Array) -> float:
         """See `ContactTerm.longest_step`."""
         return 1.0 if self.contact is None else self.contact.longest_step(y, direction)
+
+    def trusted(self, y: Array) -> float:
+        """See `ContactTerm.trusted`."""
+        return math.inf if self.contact is None else self.contact.trusted(y)
 
 
 def hessian_factors(problem: Problem, stage: StepEquation | Scheme) -> tuple[float, float]:
