@@ -2,6 +2,7 @@
 
 import itertools
 import subprocess
+import sys
 import tracemalloc
 
 import meshio
@@ -589,10 +590,13 @@ def test_pvtu_files_are_read_by_their_pieces(tmp_path, count):
         read(tmp_path, "a.pvtu", whole.replace("a0.vtu", "b.vtu"))
 
 
-def test_a_file_at_which_vtk_dies_is_refused(tmp_path, monkeypatch):
-    path = written(tmp_path, "structured .vtk")
-    died = subprocess.CompletedProcess([], -11)
-    monkeypatch.setattr("pdcorrect.fem.vtk_files.subprocess.run", lambda *_, **__: died)
+def test_a_file_at_which_vtk_dies_is_refused(tmp_path):
+    path = written(tmp_path, "structured ascii .vtk")
+    text = path.read_text()
+    assert "DIMENSIONS 3 2 2" in text
+    path.write_text(text.replace("DIMENSIONS 3 2 2", "DIMENSIONS 30000 30000 30000"))
+    child = [sys.executable, "-m", "pdcorrect.fem.vtk_files", path, tmp_path / "grid.npz"]
+    assert subprocess.run(child, capture_output=True).returncode != 0
     with pytest.raises(MeshError, match="cubes.vtk: cannot be read by VTK"):
         read_hex_mesh(path)
 
