@@ -88,6 +88,60 @@ def test_an_existing_file_is_kept_unless_told(program, scene_file, tmp_path):
     assert len(pc.load_trajectory(output)) == 1
 
 
+def test_no_output_is_replaced_unless_told(program, tmp_path, monkeypatch):
+    probes = [{"name": "end", "point": [0.08, 0, 0]}]
+    scene, run = tmp_path / "scene.toml", tmp_path / "run.h5"
+    scene.write_text(beam((4, 1, 1), time={"frames": 1}, probes=probes).to_toml())
+    assert program("simulate", scene, "-o", run)[0] == 0
+    beside, plain = tmp_path / "b.h5", tmp_path / "plain.toml"
+    plain.write_text(beam((4, 1, 1), time={"frames": 1}).to_toml())
+    for arguments, name in (
+        (("simulate", scene, "-o", run), "run_probes.csv"),
+        (("simulate", plain, "-o", run), "run.h5"),
+        (("simulate", scene, "-o", beside), "b_probes.csv"),
+        (("simulate", scene, "-o", beside, "--vtu", tmp_path), "b.pvd"),
+        (("simulate", scene, "-o", beside, "--report", tmp_path), "index.html"),
+        (("compare", scene, "-o", tmp_path, "--no-figures", "--frames", 1), "index.html"),
+        (("render", run, "-o", tmp_path / "run.png", "--size", "200x200"), "run.png"),
+        (("export", run, "-o", tmp_path, "--no-stress"), "run.pvd"),
+        (("evaluate", "tiny", "data", "-o", tmp_path, "--no-figures"), "summary.json"),
+        (("dataset", "info", "data", "--json", tmp_path / "info.json"), "info.json"),
+    ):
+        output = tmp_path / name
+        kept = output.read_bytes() if output.exists() else b"precious"
+        output.write_bytes(kept)
+        status, _, err = program(*arguments)
+        assert (status, output.read_bytes()) == (FAILED, kept)
+        assert err.startswith(f"error: {output}: exists")
+        assert not beside.exists()
+        if arguments[0] in ("render", "export"):
+            assert program(*arguments, "--overwrite")[0] == 0
+            assert output.read_bytes() != kept
+        if output != run:
+            output.unlink()  # so that the next command meets its own output only
+
+
+@pytest.mark.parametrize("command", ["simulate", "compare"])
+@pytest.mark.parametrize(
+    ("changes", "key"),
+    [
+        ({"probes": [{"name": "a", "point": [9, 0, 0]}]}, "probes[0].point"),
+        ({"probes": [{"name": "a", "region": {"group": "b"}}]}, "probes[0].region.group"),
+        ({"clamps": [{"region": {"group": "b"}}]}, "clamps[0].region.group"),
+        ({"clamps": [], "time": {"integrator": "quasi-static"}}, "clamps let the body move"),
+    ],
+)
+def test_errors_about_a_scene_name_its_file_before_a_step(
+    program, tmp_path, monkeypatch, command, changes, key
+):
+    monkeypatch.setattr("pdcorrect.solvers.rollout.march", None)  # what works raises TypeError
+    path = tmp_path / "scene.toml"
+    path.write_text(beam((2, 1, 1), **changes).to_toml())
+    status, _, err = program(command, path, "-o", tmp_path / "out")
+    assert status == BAD_INPUT
+    assert f"error: {path}: {key}" in err
+
+
 @pytest.mark.parametrize(
     ("change", "told"),
     [

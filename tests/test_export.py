@@ -69,7 +69,9 @@ def test_every_second_frame_and_no_stresses_if_asked(program, short, tmp_path):
     for name in ("a[1].h5", "a1.h5"):  # several runs share a folder
         path, _ = stored(tmp_path, short, name=name)
         assert program("export", path, "-o", tmp_path / "out", "--no-stress")[0] == 0
-    assert program("export", tmp_path / "a[1].h5", "-o", tmp_path / "out", "--every", 4)[0] == 0
+    again = ("export", tmp_path / "a[1].h5", "-o", tmp_path / "out", "--every", 4)
+    assert program(*again)[0] == FAILED
+    assert program(*again, "--overwrite")[0] == 0
     names = {p.name for p in (tmp_path / "out").iterdir()}
     assert {n for n in names if n.startswith("a[1]_")} == {"a[1]_0000.vtu", "a[1]_0004.vtu"}
     assert sum(n.startswith("a1_") for n in names) == 5

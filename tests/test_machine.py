@@ -10,6 +10,7 @@ import pytest
 
 import pdcorrect as pc
 from conftest import beam
+from pdcorrect._files import write_bytes
 
 WITHOUT_A_CACHE = """
 import warnings
@@ -94,3 +95,16 @@ import numba
 assert numba.get_num_threads() == 1
 """
     subprocess.run([sys.executable, "-c", script], check=True)
+
+
+def test_a_file_is_on_the_disk_before_it_takes_its_name(tmp_path, monkeypatch):
+    path, synced = tmp_path / "a", []
+    path.write_bytes(b"old")
+
+    def sync(file):
+        synced.append((os.fstat(file).st_size, path.read_bytes()))
+
+    monkeypatch.setattr(os, "fsync", sync)
+    write_bytes(path, b"newer")
+    assert synced == [(5, b"old")]
+    assert path.read_bytes() == b"newer"

@@ -1,6 +1,8 @@
 """Kinds of mesh files that programs write: two cubes in a row, whatever stands beside them."""
 
 import itertools
+import subprocess
+import sys
 import tracemalloc
 
 import meshio
@@ -8,6 +10,7 @@ import numpy as np
 import pytest
 
 from pdcorrect.errors import MeshError, PdcorrectWarning
+from pdcorrect.fem.hexahedron import VTK_FACES
 from pdcorrect.fem.mesh_files import read_hex_mesh
 
 POINTS = 0.1 * np.array(list(itertools.product(range(3), range(2), range(2))))
@@ -87,6 +90,10 @@ QUAD = np.array([[1, 3, 4, 2]])
         ([(0, 0, 1, 1), (1, *BOX, 1, 3, 0), (1, *BOX, 0, 1, 1)], {"left side": (0, 1, 0)}),
         ([(0, 0, 1, 1), (1, *BOX, 2, 3, 4, 0), (1, *BOX, 2, -7, 8, 1, 1)],
          {"left side": (0, 1, 0), "4": (0, 1, 0), "Körper": (2, 0, 0), "8": (2, 0, 0)}),
+        ([(0, 0, 1, 1), (1, *BOX, 1, 1, 0), (1, *BOX, 1, 1, 1, 1)],
+         {"surface 1": (0, 1, 0), "volume 1": (2, 0, 0)}),
+        ([(0, 0, 1, 1), (1, *BOX, 1, 7, 0), (1, *BOX, 1, 7, 1, 1)],
+         {"7": (0, 1, 0), "Körper": (2, 0, 0)}),
         ([(0, 0, 1, 1), (1, *BOX, 0, 0), (1, *BOX, 0, 0)], {}),
     ],
 )  # fmt: skip
@@ -457,6 +464,31 @@ def test_sets_of_abaqus(tmp_path):
     assert mesh.groups["Skin"].faces.tolist() == [[0, 0], [1, 1]]
 
 
+def test_nodes_of_element_sets_and_surfaces_of_faces_are_read(tmp_path):
+    text = FLAT + (
+        "*ELSET, ELSET=Left\n1\n*NSET, NSET=Corners, ELSET=left\n"
+        "*SURFACE, TYPE=ELEMENT, NAME=Ends\nLEFT, S6\n 2, s4\n"
+        "*SURFACE, NAME=Outside, TYPE=ELEMENT\nLeft,\n"  # all its free faces: not read
+        "*SURFACE, NAME=Points, TYPE=NODE\nCorners,\n"
+        "*SURFACE, NAME=Both, COMBINE=UNION\nEnds, Outside\n"
+    )
+    mesh = read(tmp_path, "a.inp", text)
+    assert_two_cubes(mesh)
+    assert sizes(mesh) == {"Left": (1, 0, 0), "Corners": (0, 0, 8), "Ends": (0, 2, 0)}
+    assert mesh.groups["Corners"].nodes.tolist() == list(range(8))
+    corners = mesh.cells[mesh.groups["Ends"].faces[:, 0]]
+    sides = [c[VTK_FACES[s]] for c, s in zip(corners, mesh.groups["Ends"].faces[:, 1], strict=True)]
+    assert [set(mesh.positions[side][:, 0]) for side in sides] == [{0.0}, {0.2}]
+
+
+@pytest.mark.parametrize("side", range(1, 7))
+def test_every_side_of_an_abaqus_element(tmp_path, side):
+    mesh = read(tmp_path, "a.inp", FLAT + f"*SURFACE, NAME=A\n1, S{side}\n")
+    ((_, face),) = mesh.groups["A"].faces
+    numbers = {1: "1234", 2: "5678", 3: "1265", 4: "2376", 5: "3487", 6: "4158"}  # of Abaqus
+    assert {f"{k + 1}" for k in VTK_FACES[face]} == set(numbers[side])
+
+
 # --- VTK -------------------------------------------------------------------------------------
 
 
@@ -541,6 +573,32 @@ NOTHING = (np.zeros((0, 3)), np.zeros((0, 8), np.int64))
 def test_pieces_are_joined_at_their_seams(tmp_path, parts, order):
     pytest.importorskip("pyvista")
     assert_two_cubes(read(tmp_path, "a.vtu", pieces(*parts)), order)
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_pvtu_files_are_read_by_their_pieces(tmp_path, count):
+    pytest.importorskip("pyvista")
+    parts = ((POINTS, CELLS),) if count == 1 else (FIRST, SECOND)
+    head = '<VTKFile type="PUnstructuredGrid" version="0.1"><PUnstructuredGrid GhostLevel="0">'
+    head += '<PPoints><PDataArray type="Float64" NumberOfComponents="3"/></PPoints>'
+    for k, part in enumerate(parts):
+        (tmp_path / f"a{k}.vtu").write_text(pieces(part))
+        head += f'<Piece Source="a{k}.vtu"/>'
+    whole = head + "</PUnstructuredGrid></VTKFile>"
+    assert_two_cubes(read(tmp_path, "a.pvtu", whole))
+    with pytest.raises(MeshError, match="b.vtu: cannot be read"):
+        read(tmp_path, "a.pvtu", whole.replace("a0.vtu", "b.vtu"))
+
+
+def test_a_file_at_which_vtk_dies_is_refused(tmp_path):
+    path = written(tmp_path, "structured ascii .vtk")
+    text = path.read_text()
+    assert "DIMENSIONS 3 2 2" in text
+    path.write_text(text.replace("DIMENSIONS 3 2 2", "DIMENSIONS 30000 30000 30000"))
+    child = [sys.executable, "-m", "pdcorrect.fem.vtk_files", path, tmp_path / "grid.npz"]
+    assert subprocess.run(child, capture_output=True).returncode != 0
+    with pytest.raises(MeshError, match="cubes.vtk: cannot be read by VTK"):
+        read_hex_mesh(path)
 
 
 @pytest.mark.parametrize("shift", [1e-7, 3.0])

@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 import pdcorrect as pc
 from conftest import CLAMPED, beam
 from pdcorrect.cli.program import app
-from pdcorrect.errors import PdcorrectWarning, SceneError
+from pdcorrect.errors import ConvergenceError, PdcorrectWarning, SceneError
 from pdcorrect.fem.clamps import Clamps, check_held
 
 QUASI_STATIC = {"step": 0.1, "frames": 1, "integrator": "quasi-static"}
@@ -87,6 +87,25 @@ def test_an_obstacle_may_hold_statics():
     result = pc.Newton(problem)(problem.rest_state())
     carried = pc.contact_forces(problem, result.state).sum(axis=(0, 1))
     np.testing.assert_allclose(carried, [0, 0, 9.81 * problem.mass.sum()], rtol=1e-6, atol=1e-9)
+
+
+SLIDE = [{"kind": "gravity", "acceleration": [0.1, 0, -9.81]}]
+PUSH = {"kind": "pressure", "pressure": 1e3, "region": {"plane": "z", "at": "max"}}
+
+
+@pytest.mark.parametrize(
+    ("kind", "clamps", "loads", "loose"),
+    [
+        (pc.Newton, [Y], SLIDE, "move along x"),
+        (pc.ProjectiveDynamics, [Y], SLIDE, "move along x"),
+        (pc.Newton, [EDGE], [{**PUSH, "follower": True}], "turn about y"),
+    ],
+)
+def test_statics_that_no_obstacle_holds_name_the_motion_where_they_fail(kind, clamps, loads, loose):
+    floor = {"shape": "plane", "point": [0, 0, -0.1], "normal": [0, 0, 1]}
+    scene = plausible(clamps=clamps, loads=loads, time=QUASI_STATIC, obstacles=[floor])
+    with pytest.raises(ConvergenceError, match=f"the body .*{loose}"):
+        pc.rollout(kind(pc.discretise(scene)))
 
 
 def test_rounding_is_no_turn():

@@ -124,6 +124,10 @@ motion = { times = [0, 1], displacement = [[0, 0, 0]] }
             changed('plane = "x", at', 'everywhere = true, plane = "x", at'),
             'clamps[0].region = { everywhere = true, plane = "x", at = 0.0 }',
         ),
+        (
+            changed('plane = "x", at = 0.0', "box = [[0, 0, 1], [1, 1, 0]]"),
+            "clamps[0].region.box = [[0, 0, 1], [1, 1, 0]]",
+        ),
         (changed("[[clamps]]", "[[clamps]]\nat = 0.0"), "clamps[0].at: unknown key"),
         (f"{TEXT}{MOVING}", "clamps[1].motion = { times = [0, 1], displacement = [[0, 0, 0]] }"),
         (changed('"gravity"', '"gravty"'), 'loads[0].kind = "gravty"'),

@@ -609,7 +609,7 @@ def test_wrong_shapes_and_options_are_refused():
         pc.ProjectiveDynamics(problem)(problem.rest_state(), time_step=-1)
     with pytest.raises(InputError, match="expected a Scene"):
         pc.discretise("scene.toml")
-    for bad in ({"frames": -1}, {"frames": 2.5}, {"on_failure": "pray"}):
+    for bad in ({"frames": -1}, {"frames": 0}, {"frames": 2.5}, {"on_failure": "pray"}):
         with pytest.raises(InputError, match="expected"):
             pc.rollout(pc.ProjectiveDynamics(problem), **bad)
     with pytest.raises(InputError, match=r"problem is a Scene: expected pc.discretise"):

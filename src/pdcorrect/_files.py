@@ -27,6 +27,8 @@ def replacing(path: Path, part: Path | None = None) -> Iterator[Path]:
     part = part_of(path) if part is None else part
     try:
         yield part
+        with part.open("rb+") as file:
+            os.fsync(file.fileno())  # else a crash of the machine may leave an empty file
         part.replace(path)
     finally:
         with contextlib.suppress(OSError):
@@ -36,6 +38,19 @@ def replacing(path: Path, part: Path | None = None) -> Iterator[Path]:
 def part_of(path: Path) -> Path:
     """Where what is to replace a file is written."""
     return path.with_name(path.name + ".part")
+
+
+def check_new(
+    *paths: Path,
+    overwrite: bool,
+    remedy: str = "choose another name, or replace it with --overwrite (overwrite=True)",
+) -> None:
+    """Refuse to replace files, unless told to, and ever what is no file."""
+    for path in paths:
+        if path.exists() and not path.is_file():
+            raise OutputError(f"{path}: is a folder, a device or a pipe; give the name of a file.")
+        if path.exists() and not overwrite:
+            raise OutputError(f"{path}: exists already; {remedy}.")
 
 
 def write_text(path: Path, text: str) -> None:

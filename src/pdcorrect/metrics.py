@@ -259,13 +259,11 @@ def probes(run: Trajectory, problem: Problem | None = None) -> dict[str, Array]:
     ------
     InputError
         If the run has no problem and none is given, as of a run that was read from a file.
-    SceneError
-        If a probe is outside the body.
     """
     problem = run.problem if problem is None else problem
     if problem is None:
         raise InputError("the run has no problem: expected probes(run, problem).")
-    weights = probe_weights(problem)
+    weights = probe_weights(problem, problem.scene.probes)
     moved = run.positions - run.points
     return {
         probe.name: np.stack([np.asarray(row @ frame).ravel() for frame in moved])

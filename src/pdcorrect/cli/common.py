@@ -6,14 +6,14 @@ import contextlib
 import os
 import time
 from collections.abc import Callable, Iterator, Sequence
-from functools import cache
+from functools import cache, wraps
 from itertools import count
 from pathlib import Path
 from typing import Annotated, Any, Optional
 
 import typer
 
-from pdcorrect.errors import InputError, require_extra
+from pdcorrect.errors import InputError, SceneError, require_extra
 
 FAILED, BAD_INPUT = 1, 2
 """Exit statuses."""
@@ -60,6 +60,20 @@ SkipDamaged = Annotated[
 Incomplete = Annotated[
     bool, typer.Option("--incomplete", help="Also if files of a split are missing.")
 ]
+
+
+def naming_scene(command: Callable[..., None]) -> Callable[..., None]:
+    """Have all errors about a scene name its file, as those of `Scene.load` do."""
+
+    @wraps(command)
+    def run(scene: Path, **options: Any) -> None:
+        try:
+            command(scene, **options)
+        except SceneError as error:
+            told = str(error)
+            raise SceneError(told if told.startswith(f"{scene}:") else f"{scene}: {told}") from None
+
+    return run
 
 
 def say(text: str) -> None:

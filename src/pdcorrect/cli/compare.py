@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from pdcorrect.trajectory import Trajectory
 
 
+@common.naming_scene
 def compare(
     scene: common.SceneFile,
     output: common.OutputFolder = Path("comparison"),
@@ -39,6 +40,7 @@ def compare(
         bool, typer.Option("--vtu", help="Also write all runs, with stress, for ParaView.")
     ] = False,
     figures: common.Figures = True,
+    overwrite: common.Overwrite = False,
 ) -> None:
     """Run coarse, best coarse, intermediate and fine PD and coarse Newton; report error and time.
 
@@ -49,10 +51,11 @@ def compare(
     have learned from, and the coarse models that they correct are compared too.  Exit status 1 if
     a solver failed; the report then has the others, unless it was the fine run.
     """
-    from pdcorrect._files import make_folder
+    from pdcorrect._files import check_new, make_folder
     from pdcorrect.evaluation import compare as evaluate
     from pdcorrect.evaluation import converged as reference
     from pdcorrect.evaluation import report
+    from pdcorrect.evaluation.page import PAGE
     from pdcorrect.scene import Scene
 
     if figures:
@@ -67,6 +70,7 @@ def compare(
         loaded, model or [], gate=gate, hex27=hex27, learned=learned, second_order=converged
     )
     make_folder(output / report.VTU if vtu else output)
+    check_new(output / PAGE, overwrite=overwrite)
     common.tell_of_compiling()
     count = frames or loaded.time.frames
     finer = _finer(loaded, count) if estimate_error else None

@@ -9,7 +9,7 @@ from typing import Annotated, Optional
 
 import typer
 
-from pdcorrect._files import INTERRUPTED, Terminated, make_folder, write_text
+from pdcorrect._files import INTERRUPTED, Terminated, check_new, make_folder, write_text
 from pdcorrect.cli import common
 from pdcorrect.errors import InputError
 
@@ -87,11 +87,15 @@ def info(
     folder: Folder,
     json: Annotated[Optional[Path], typer.Option(help="File for all numbers.")] = None,
     skip_damaged: common.SkipDamaged = False,
+    overwrite: common.Overwrite = False,
 ) -> None:
     """Summarise a data set: sizes, materials, motions, errors of the runs, cost."""
     from pdcorrect.data.folder import all_shards
     from pdcorrect.data.summary import dataset_info
 
+    if json:
+        make_folder(json.parent)
+        check_new(json, overwrite=overwrite)
     count = len(all_shards(folder))
     with common.progress_bar("reading", count, unit="files", apart=True) as advance:
         found = dataset_info(folder, advance, skip_damaged=skip_damaged)
@@ -100,7 +104,6 @@ def info(
     for text in found.damaged.values():
         typer.echo(f"left out: {text}", err=True)
     if json:
-        make_folder(json.parent)
         write_text(json, found.to_json() + "\n")
         typer.echo(f"wrote {json}")
 

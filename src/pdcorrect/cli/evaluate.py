@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Optional
 
 import typer
 
+from pdcorrect._files import check_new
 from pdcorrect.cli import common
 from pdcorrect.errors import require_extra
 
@@ -36,6 +37,7 @@ def evaluate(
     seed: Annotated[int, typer.Option(help="Of the bootstrap intervals.", min=0)] = 0,
     incomplete: common.Incomplete = False,
     figures: common.Figures = True,
+    overwrite: common.Overwrite = False,
 ) -> None:
     """Measure models, and the stored runs of a data set, against its reference.
 
@@ -43,11 +45,13 @@ def evaluate(
     """
     from pdcorrect.evaluation.evaluation import DEFAULT_GATE, saved_candidates
     from pdcorrect.evaluation.evaluation import evaluate as run
-    from pdcorrect.evaluation.tables import write_evaluation
+    from pdcorrect.evaluation.tables import SUMMARY, write_evaluation
 
     *models, folder = paths
     if output and figures:
         require_extra("matplotlib", "view")
+    if output:
+        check_new(output / SUMMARY, overwrite=overwrite)
     refuses = DEFAULT_GATE if gate else None
     saved = saved_candidates(models, device, gate=refuses)
     common.tell_of_compiling()

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pdcorrect.cli.common import OutputFolder, say
+from pdcorrect.cli.common import OutputFolder, Overwrite, say
 from pdcorrect.errors import FileFormatError, InputError
 
 if TYPE_CHECKING:
@@ -27,17 +27,19 @@ def export(
     salvage: Annotated[
         bool, typer.Option("--salvage", help="Of a file that was cut short: what survives of it.")
     ] = False,
+    overwrite: Overwrite = False,
 ) -> None:
     """Write a run for ParaView: one VTU a frame, and a PVD with the times to open.
 
     Points have displacement, velocity, stress and von Mises stress, cells von Mises stress and the
-    smallest det F.  An older series of the same run in the folder is replaced.
+    smallest det F.
     """
-    from pdcorrect._files import make_folder
+    from pdcorrect._files import check_new, make_folder
     from pdcorrect.io.vtk import write_vtu_series
 
     loaded = _loaded(run, salvage)
     make_folder(output)
+    check_new(output / f"{run.stem}.pvd", overwrite=overwrite)
     problem = _stepped(loaded, run) if stress else None
     say(f"wrote {write_vtu_series(loaded, output, every=every, name=run.stem, stress_of=problem)}")
 

@@ -8,7 +8,8 @@ from typing import Annotated, Any, Optional
 
 import typer
 
-from pdcorrect.cli.common import say
+from pdcorrect._files import check_new
+from pdcorrect.cli.common import Overwrite, say
 from pdcorrect.errors import InputError
 
 Colour = StrEnum("Colour", ["displacement", "stress", "error", "none", "volume"])
@@ -33,6 +34,7 @@ def render(
         Optional[str], typer.Option(help="Cut by a plane, x=0.02 (m), through the body at rest.")
     ] = None,
     size: Annotated[Optional[str], typer.Option(help="WIDTHxHEIGHT of the picture.")] = None,
+    overwrite: Overwrite = False,
 ) -> None:
     """Draw one run or several side by side; errors are against the last run given.
 
@@ -46,6 +48,7 @@ def render(
     still = output.suffix.lower() == ".png"
     if frame is not None and not still:
         raise InputError(f"--frame with {output.suffix}: a film shows all frames; leave it out.")
+    check_new(output, overwrite=overwrite)
     number = -1 if frame is None else frame
     view = _camera(camera)
     field: Any = None if colour is Colour.none else colour.value

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 SolverName = StrEnum("SolverName", ["pd", "newton"])
 
 
+@common.naming_scene
 def simulate(
     scene: common.SceneFile,
     output: Annotated[Path, typer.Option("-o", "--output", help="Trajectory file (HDF5).")],
@@ -52,7 +53,6 @@ def simulate(
 
     Exit status 1 if frames ended with inverted cells, which are written all the same.
     """
-    from pdcorrect._files import make_folder
     from pdcorrect.evaluation.run_report import summary, write_run_report
     from pdcorrect.io.trajectory import load_trajectory
     from pdcorrect.scene import Scene
@@ -68,17 +68,12 @@ def simulate(
             "on: expected --refine 1, --solver pd and no --learned."
         )
     loaded = Scene.load(scene)
-    for folder in filter(None, (vtu, report)):
-        make_folder(folder)
     if report:
         require_extra("pyvista", "view")
         require_extra("matplotlib", "view")
+    _check_outputs(loaded, output, vtu, report, overwrite, resume)
     common.tell_of_compiling()
     stepper = _make_stepper(loaded, solver, refine, learned, model, gate)
-    if loaded.probes:
-        from pdcorrect.fem.probes import probe_weights
-
-        probe_weights(stepper.problem)  # what is wrong is told before the run
     origin = getattr(stepper, "origin", None)
     if origin:
         told = "model {model} on the base {base}, trained on {dataset} with {trained_integrator}"
@@ -113,6 +108,22 @@ def simulate(
         common.say(f"report: {page}")
     if inverted and not allow_inverted:
         raise typer.Exit(common.FAILED)
+
+
+def _check_outputs(
+    scene: Scene, output: Path, vtu: Path | None, report: Path | None, overwrite: bool, resume: bool
+) -> None:
+    """Refuse what cannot be written, before the run."""
+    from pdcorrect._files import check_new, make_folder
+    from pdcorrect.evaluation.page import PAGE
+    from pdcorrect.io.probes import probes_file
+
+    for folder in filter(None, (vtu, report)):
+        make_folder(folder)
+    beside = [probes_file(output)] if scene.probes else []
+    beside += [vtu / f"{output.stem}.pvd"] if vtu else []
+    beside += [report / PAGE] if report else []
+    check_new(*beside, overwrite=overwrite or resume)
 
 
 def _make_stepper(

@@ -115,6 +115,7 @@ def train_element(
         raise typer.Exit(common.FAILED)
 
 
+@common.naming_scene
 def tune_element(
     scene: common.SceneFile,
     output: Annotated[Path, typer.Option("-o", "--output", help="File of weights, *.safetensors.")],

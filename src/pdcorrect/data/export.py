@@ -14,7 +14,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from pdcorrect._files import make_folder, write_text
+from pdcorrect._files import check_new, make_folder, write_text
 from pdcorrect.data.configuration import EVALUATION, TRAINING, VALIDATION
 from pdcorrect.data.folder import missing_files, shard_paths, splits_of
 from pdcorrect.data.schema import PLAIN, REFERENCE, SUFFIX, Shard, Simulation, read_shard
@@ -41,12 +41,7 @@ def _staging_folder(target: Path, overwrite: bool) -> Iterator[Path]:
     try:
         yield staging
         names = sorted(path.name for path in staging.iterdir())
-        there = [name for name in names if (target / name).exists()]
-        if there and not overwrite:
-            raise OutputError(
-                f"{target / there[0]}: exists already; choose another folder, or replace it with "
-                "--overwrite (overwrite=True)."
-            )
+        check_new(*(target / name for name in names), overwrite=overwrite)
         others = [path for path in sorted(target.glob("*.h5")) if path.name not in names]
         if "meta.json" in names and others:
             raise OutputError(f"{others[0]}: is of another export: expected an empty folder.")

@@ -28,8 +28,8 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from pdcorrect._files import make_folder, write_bytes
-from pdcorrect.errors import FileFormatError, FileVersionError, InputError, OutputError
+from pdcorrect._files import check_new, make_folder, write_bytes
+from pdcorrect.errors import FileFormatError, FileVersionError, InputError
 
 FORMAT, VERSION = "pdcorrect-dataset", 1
 USER_BLOCK = 512
@@ -147,10 +147,7 @@ def write_shard(
     path = Path(path)
     if dtype not in ("float32", "float64"):
         raise InputError(f"dtype = {dtype!r}: expected 'float32' or 'float64'.")
-    if path.exists() and not overwrite:
-        raise OutputError(
-            f"{path}: exists already; choose another name, or overwrite it with overwrite=True."
-        )
+    check_new(path, overwrite=overwrite)
     image = io.BytesIO()
     with h5py.File(image, "w", libver=("v110", "v110"), userblock_size=USER_BLOCK) as file:
         _write(file, shard, np.dtype(dtype))

@@ -13,12 +13,12 @@ import torch
 from safetensors.torch import load
 
 from pdcorrect._environment import environment
-from pdcorrect._files import make_folder, write_text
+from pdcorrect._files import check_new, make_folder, write_text
 from pdcorrect.elements.answers import answers
 from pdcorrect.elements.bodies import Grid, VoxelBody, box, connected, holds, nodes_of
 from pdcorrect.elements.linear import Batch, Errors, collate, errors, loss, means, sample
 from pdcorrect.elements.network import Descent, ElementNetwork
-from pdcorrect.errors import ConvergenceError, InputError, OutputError, PdcorrectWarning
+from pdcorrect.errors import ConvergenceError, InputError, PdcorrectWarning
 from pdcorrect.fem.element_network import MODEL, read_network, write_network
 from pdcorrect.fem.learned import LARGEST_POISSON, effective_moduli
 from pdcorrect.fem.neighbourhood import on_grid
@@ -81,10 +81,7 @@ def tune(
     """
     if path.suffix != ".safetensors":
         raise InputError(f"{path}: expected a name that ends with .safetensors.")
-    if path.exists() and not overwrite:
-        raise OutputError(
-            f"{path}: exists already: expected a new name, or --overwrite (overwrite=True)."
-        )
+    check_new(path, overwrite=overwrite)
     body = own_body(problem)
     make_folder(path.parent)
     rng = np.random.default_rng(seed)

@@ -41,6 +41,8 @@ $figures
 <footer>Measured on: $environment.</footer>
 </html>
 """)
+PAGE = "index.html"
+"""Usual name."""
 _TYPES = {".png": "image/png", ".gif": "image/gif"}
 
 

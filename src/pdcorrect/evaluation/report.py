@@ -18,7 +18,7 @@ from pdcorrect._environment import environment
 from pdcorrect._files import make_folder, write_text
 from pdcorrect.evaluation.compare import Comparison, Row
 from pdcorrect.evaluation.converged import MESH_ERROR, TIME_ERROR
-from pdcorrect.evaluation.page import write_page
+from pdcorrect.evaluation.page import PAGE, write_page
 from pdcorrect.io.vtk import delete_vtu_series, write_vtu_series
 from pdcorrect.metrics import largest_displacement, probes
 from pdcorrect.scene import Scene
@@ -27,7 +27,6 @@ from pdcorrect.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 
-PAGE = "index.html"
 VTU = "vtu"
 """Folder, inside a report's, of what `write_series` writes."""
 _NOT_UNIQUE = 100.0

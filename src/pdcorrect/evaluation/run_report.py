@@ -9,9 +9,8 @@ from typing import Any
 
 from pdcorrect import figures
 from pdcorrect._files import make_folder
-from pdcorrect.evaluation.page import write_page
+from pdcorrect.evaluation.page import PAGE, write_page
 from pdcorrect.evaluation.report import (
-    PAGE,
     draw_places,
     farthest_point,
     film_frames,

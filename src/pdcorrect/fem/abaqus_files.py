@@ -20,7 +20,15 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from pdcorrect.errors import MeshError, PdcorrectWarning
-from pdcorrect.fem.mesh_content import Block, Content, Integers, check_once, places
+from pdcorrect.fem.mesh_content import (
+    Block,
+    Content,
+    Integers,
+    check_once,
+    chosen,
+    nodes_of,
+    places,
+)
 
 Array = NDArray[np.float64]
 
@@ -47,6 +55,13 @@ _KINDS = {
 """By dimension and number of nodes; their order is VTK's but for the last seven of 27."""
 
 
+_SIDES = {
+    "S1": [0, 1, 2, 3], "S2": [4, 7, 6, 5], "S3": [0, 4, 5, 1], "S4": [1, 5, 6, 2],
+    "S5": [2, 6, 7, 3], "S6": [3, 7, 4, 0],
+}  # fmt: skip
+"""Corners of a hexahedron's faces."""
+
+
 class _Line(NamedTuple):
     path: Path
     number: int
@@ -66,12 +81,17 @@ class _Keyword(NamedTuple):
 
 
 class _Set(NamedTuple):
-    """A set of "NSET" or "ELSET": numbers, and names of other sets, in an instance or here."""
+    """A set of "NSET", "ELSET" or "SURFACE": numbers, and names of sets, in an instance or here.
+
+    They are of the kind ``of``; of a surface each has a side.
+    """
 
     kind: str
     name: str
     instance: str
     members: list[str | range]
+    of: str
+    sides: tuple[str, ...] = ()
 
 
 @dataclass
@@ -121,6 +141,8 @@ def read_abaqus(path: Path) -> Content:
             _add_elements(here, keyword)
         elif name in ("NSET", "ELSET"):
             _add_set(here, keyword)
+        elif name == "SURFACE" and parameters.get("TYPE", "ELEMENT").upper() == "ELEMENT":
+            _add_surface(here, keyword)
     used = {id(instance.parts[0]) for instance in instances}
     unused = [name for name, part in parts.items() if name and id(part) not in used]
     if not instances:
@@ -265,7 +287,7 @@ def _wrong_count(keyword: _Keyword, line: _Line, row: list[int], size: int) -> M
 def _own_set(kind: str, keyword: _Keyword, numbers: Integers) -> _Set:
     """The set that the parameter of *NODE or *ELEMENT names."""
     name = keyword.parameters.get(kind, "")
-    return _Set(kind, name, "", list(map(str, numbers)) if name else [])
+    return _Set(kind, name, "", list(map(str, numbers)) if name else [], kind)
 
 
 def _add_set(part: _Part, keyword: _Keyword) -> None:
@@ -279,7 +301,19 @@ def _add_set(part: _Part, keyword: _Keyword) -> None:
             members.append(range(first, rest[0] + 1, max([1, *rest[1:2]])))
         else:
             members += (text.strip() for text in line.text.split(",") if text.strip())
-    part.sets.append(_Set(name, own.get(name, ""), own.get("INSTANCE", "").upper(), members))
+    of = name
+    if name == "NSET" and "ELSET" in own:  # the nodes of its elements
+        of, members = "ELSET", [own["ELSET"]]
+    part.sets.append(_Set(name, own.get(name, ""), own.get("INSTANCE", "").upper(), members, of))
+
+
+def _add_surface(part: _Part, keyword: _Keyword) -> None:
+    """A surface of faces: an element or a set of them, and the side, in each line."""
+    pairs = [[text.strip() for text in line.text.split(",")] for line in keyword.data]
+    members: list[str | range] = [first for first, *_ in pairs]
+    sides = tuple("".join(rest[:1]).upper() for _, *rest in pairs)
+    name = keyword.parameters.get("NAME", "")
+    part.sets.append(_Set("SURFACE", name, "", members, "ELSET", sides))
 
 
 def _instance(keyword: _Keyword, parts: dict[str, _Part]) -> _Instance:
@@ -311,14 +345,16 @@ class _Joined:
 
     def __init__(self, path: Path, instances: list[_Instance]) -> None:
         self._path, self._instances = path, instances
+        self._blocks: list[Block] = []
         self._numbers: dict[tuple[str, str], tuple[Integers, int]] = {}
         self._sets: dict[tuple[str, str, str], Integers] = {}
         self._groups: dict[str, dict[str, list[Integers]]] = {"NSET": {}, "ELSET": {}}
+        self._surfaces: dict[str, list[Block]] = defaultdict(list)
         self._spelled: dict[str, str] = {}
 
     def content(self) -> Content:
         """Points, elements and sets; those of one of several instances as ``instance.set``."""
-        points, blocks, start, elements = [np.zeros((0, 3))], [], 0, 0
+        points, start, elements = [np.zeros((0, 3))], 0, 0
         for name, parts, rotation, offset in self._instances:
             nodes = [each for part in parts for each in part.nodes]
             numbers = np.concatenate([np.zeros(0, np.int64), *(own for own, _ in nodes)])
@@ -327,7 +363,8 @@ class _Joined:
             found = [each for part in parts for each in part.elements]
             placed = places(numbers, [rows for _, _, rows in found], str(self._path))
             for (dimension, own, _), place in zip(found, placed, strict=True):
-                blocks.append(Block(_KINDS[dimension, place.shape[1]], dimension, start + place))
+                kind = _KINDS[dimension, place.shape[1]]
+                self._blocks.append(Block(kind, dimension, start + place))
                 labels.append(own)
             check_once(np.concatenate(labels), f"{self._path}: element")
             self._numbers["NSET", name.upper()] = numbers, start
@@ -336,37 +373,63 @@ class _Joined:
             prefix = f"{name}." if name and len(self._instances) > 2 else ""
             for each in (each for part in parts for each in part.sets if each.name):
                 self._add(each, each.instance or name.upper(), prefix + each.name)
+        for name, faces in self._surfaces.items():
+            own = elements + np.arange(sum(len(block.nodes) for block in faces))
+            self._groups["ELSET"].setdefault(name, []).append(own)
+            self._blocks += faces
+            elements += len(own)
         groups = {
             kind: {name: np.unique(np.concatenate(own)) for name, own in found.items()}
             for kind, found in self._groups.items()
         }
-        return Content(np.concatenate(points), blocks, groups["ELSET"], groups["NSET"])
+        return Content(np.concatenate(points), self._blocks, groups["ELSET"], groups["NSET"])
 
     def _add(self, added: _Set, scope: str, name: str) -> None:
         """Keep a set, unless it names what is not read."""
+        if added.kind == "SURFACE":
+            self._add_faces(added, scope, self._spelled.setdefault(name.upper(), name))
+            return
+        members = self._members(added.of, added.members, scope)
+        if members is not None and added.kind != added.of:
+            members = nodes_of(self._blocks, members)
+        if members is not None and len(members):
+            key = added.kind, scope, added.name.upper()
+            self._sets[key] = np.append(self._sets.get(key, members[:0]), members)
+            name = self._spelled.setdefault(name.upper(), name)
+            self._groups[added.kind].setdefault(name, []).append(members)
+
+    def _add_faces(self, added: _Set, scope: str, name: str) -> None:
+        """Keep a surface as quadrilaterals, unless it names what is not read."""
+        faces = []
+        for member, side in zip(added.members, added.sides, strict=True):
+            members = self._members(added.of, [member], scope)
+            if members is None or side not in _SIDES:
+                return
+            solids = (block for block in chosen(self._blocks, members) if block.dimension == 3)
+            faces += [Block("quad", 2, block.nodes[:, _SIDES[side]]) for block in solids]
+        if faces:
+            self._surfaces[name] += faces
+
+    def _members(self, kind: str, members: list[str | range], scope: str) -> Integers | None:
+        """Places of nodes or elements, by their numbers and sets; None if one is not known."""
         found = [np.zeros(0, np.int64)]
         labels: dict[str, list[int]] = defaultdict(list)
-        for member in added.members:
+        for member in members:
             if isinstance(member, range):
-                numbers, start = self._numbers.get((added.kind, scope), (found[0], 0))
-                chosen = (numbers >= member.start) & (numbers < member.stop)
-                chosen &= (numbers - member.start) % member.step == 0
-                found.append(start + np.flatnonzero(chosen))
+                numbers, start = self._numbers.get((kind, scope), (found[0], 0))
+                inside = (numbers >= member.start) & (numbers < member.stop)
+                inside &= (numbers - member.start) % member.step == 0
+                found.append(start + np.flatnonzero(inside))
                 continue
             owner, _, label = member.rpartition(".")
             owner = owner.upper() or scope
             if label.isdecimal() and len(label) <= _DIGITS:
                 labels[owner].append(int(label))
-            elif (known := self._sets.get((added.kind, owner, label.upper()))) is not None:
+            elif (known := self._sets.get((kind, owner, label.upper()))) is not None:
                 found.append(known)
             else:
-                return
+                return None
         for owner, wanted in labels.items():
-            numbers, start = self._numbers.get((added.kind, owner), (found[0], 0))
+            numbers, start = self._numbers.get((kind, owner), (found[0], 0))
             found.append(start + np.flatnonzero(np.isin(numbers, wanted)))
-        members = np.concatenate(found)
-        if len(members):
-            key = added.kind, scope, added.name.upper()
-            self._sets[key] = np.append(self._sets.get(key, found[0]), members)
-            name = self._spelled.setdefault(name.upper(), name)
-            self._groups[added.kind].setdefault(name, []).append(members)
+        return np.concatenate(found)

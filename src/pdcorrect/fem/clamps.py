@@ -256,9 +256,19 @@ class Course:
 
 
 def check_held(positions: Array, cells: NDArray[np.int64], clamps: Clamps) -> None:
-    """Refuse a body, or one of its parts, that clamps let move as a rigid one.
+    """Refuse a body of which `rigid_freedom` says something: without inertia it has no solution."""
+    told = rigid_freedom(positions, cells, clamps)
+    if told:
+        raise SceneError(
+            f"{told}: expected clamps against every rigid motion, for quasi-static bodies have no "
+            "inertia."
+        )
 
-    Of nodes at positions (N, 3), m: without inertia such a motion has no solution.
+
+def rigid_freedom(positions: Array, cells: NDArray[np.int64], clamps: Clamps) -> str:
+    """How clamps let a body of nodes at positions (N, 3), m, or a part of it, move as a rigid one.
+
+    Empty if they hold it.
     """
     part = connected_parts(cells, len(positions))
     count = int(part.max()) + 1
@@ -282,10 +292,8 @@ def check_held(positions: Array, cells: NDArray[np.int64], clamps: Clamps) -> No
             if space.size
         ]
         which = "the body" if count == 1 else f"the part of the body at node {nodes[0]}"
-        raise SceneError(
-            f"clamps let {which} {' and '.join(told)}: expected clamps against every rigid motion, "
-            "for quasi-static bodies have no inertia."
-        )
+        return f"clamps let {which} {' and '.join(told)}"
+    return ""
 
 
 def _directions(space: Array) -> list[str]:

@@ -7,7 +7,7 @@ partitions, no parametric nodes, one group an entity, and none with ``Mesh.SaveA
 from __future__ import annotations
 
 import re
-from collections import defaultdict
+from collections import Counter, defaultdict
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -27,6 +27,8 @@ _TYPES = {
 }  # fmt: skip
 """Name, dimension and number of nodes of Gmsh's element types of first and second order."""
 
+_ENTITIES = ("point", "curve", "surface", "volume")
+"""By dimension."""
 _EDGES = [8, 11, 13, 9, 16, 18, 19, 17, 10, 12, 14, 15]
 _VTK_ORDER = {
     "hexahedron20": [*range(8), *_EDGES],
@@ -310,13 +312,19 @@ def _content(
     found: list[_Found],
     names: dict[_Entity, str],
 ) -> Content:
-    """Elements in VTK order, and groups by name, or by number where they have none."""
+    """Elements in VTK order, and groups by name, or by number where they have none.
+
+    Before a number that groups of several dimensions have stands "surface" and the like.
+    """
     blocks, members, start = [], defaultdict(list), 0
+    every = {(each.type[1], group) for each in found for group in each.groups}
+    dimensions = Counter(group for _, group in every - set(names))
     placed = places(numbers, [each.nodes for each in found], str(path))
     for ((kind, dimension, _), _, groups), nodes in zip(found, placed, strict=True):
         nodes = nodes[:, _VTK_ORDER[kind]] if kind in _VTK_ORDER else nodes
         blocks.append(Block(kind, dimension, nodes))
         for group, own in groups.items():
-            members[names.get((dimension, group), str(group))].append(start + own)
+            number = f"{_ENTITIES[dimension]} {group}" if dimensions[group] > 1 else str(group)
+            members[names.get((dimension, group), number)].append(start + own)
         start += len(nodes)
     return Content(points, blocks, {k: np.concatenate(v) for k, v in members.items()}, {})

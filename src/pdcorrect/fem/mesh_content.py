@@ -33,6 +33,23 @@ class Content(NamedTuple):
     node_groups: dict[str, Integers]
 
 
+def chosen(blocks: list[Block], elements: Integers) -> list[Block]:
+    """What the blocks hold of some elements, which are counted through all blocks."""
+    out, start = [], 0
+    for block in blocks:
+        own = elements[(elements >= start) & (elements < start + len(block.nodes))]
+        if len(own):
+            out.append(block._replace(nodes=block.nodes[own - start]))
+        start += len(block.nodes)
+    return out
+
+
+def nodes_of(blocks: list[Block], elements: Integers) -> Integers:
+    """Nodes (k,) of some elements, which are counted through all blocks."""
+    nodes = [block.nodes.ravel() for block in chosen(blocks, elements)]
+    return np.concatenate([np.zeros(0, np.int64), *nodes])
+
+
 def check_once(numbers: Integers, what: str) -> None:
     """Refuse numbers that come twice; ``what`` names the file and the kind."""
     found, counts = np.unique(numbers, return_counts=True)

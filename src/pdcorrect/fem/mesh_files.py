@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import replace
@@ -12,13 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdcorrect._files import replacing
-from pdcorrect.errors import MeshError, OutputError
+from pdcorrect.errors import MeshError, OutputError, PdcorrectWarning
 from pdcorrect.fem.abaqus_files import read_abaqus
 from pdcorrect.fem.gmsh_files import read_gmsh
 from pdcorrect.fem.hexahedron import VTK_EDGES, VTK_FACES
 from pdcorrect.fem.mesh import Group, HexMesh
 from pdcorrect.fem.mesh_checks import TOLERANCE, row_groups
-from pdcorrect.fem.mesh_content import Block, Content, Integers
+from pdcorrect.fem.mesh_content import Block, Content, Integers, nodes_of
 from pdcorrect.fem.vtk_files import read_meshio, read_vtk
 
 _HEXAHEDRA = ("hexahedron", "hexahedron20", "hexahedron27")
@@ -34,9 +35,11 @@ In VTK order: middles of edges, of faces, of the cell.
 for _row, _corners in enumerate([*VTK_EDGES, *VTK_FACES, range(8)]):
     _BETWEEN[_row, list(_corners)] = 1 / len(_corners)
 
+_CURVED = 0.25
+"""Of a cell's longest edge: how far curving puts a node; a quarter of a circle needs 0.21."""
 _READERS = {
     ".msh": read_gmsh, ".inp": read_abaqus,
-    **dict.fromkeys((".vtu", ".vtk", ".vts", ".vtr", ".vti"), read_vtk),
+    **dict.fromkeys((".vtu", ".pvtu", ".vtk", ".vts", ".vtr", ".vti"), read_vtk),
 }  # fmt: skip
 """By suffix; meshio reads all others."""
 
@@ -44,9 +47,9 @@ _READERS = {
 def read_hex_mesh(path: str | Path, scale: float = 1.0) -> HexMesh:
     """Read the hexahedra of a Gmsh, Abaqus or VTK file, and its named groups.
 
-    Of cells with 20 or 27 nodes the eight corners are kept, if the cells are
-    straight-sided.  Nodes that no cell uses are dropped; lower-dimensional
-    elements count only as parts of groups.
+    Of cells with 20 or 27 nodes the eight corners are kept; a `PdcorrectWarning` says
+    how far others are from between them, if cells are curved.  Nodes that no cell uses
+    are dropped; lower-dimensional elements count only as parts of groups.
 
     Parameters
     ----------
@@ -58,13 +61,15 @@ def read_hex_mesh(path: str | Path, scale: float = 1.0) -> HexMesh:
     ------
     MeshError
         If the file cannot be read, holds no hexahedra or other solid cells as
-        well, has curved cells, or its mesh fails a check of `HexMesh.create`.
+        well, has cells whose nodes are in another order, or its mesh fails a
+        check of `HexMesh.create`.
     """
     path = Path(path)
     try:
         content = _READERS.get(path.suffix.lower(), read_meshio)(path)
     except OSError as error:
-        raise MeshError(f"{path}: cannot be read ({error.strerror or error}).") from None
+        file = error.filename or path  # it may be one that the file names
+        raise MeshError(f"{file}: cannot be read ({error.strerror or error}).") from None
     points = content.points * scale
     if points.shape[1:] != (3,):
         raise MeshError(f"{path}: its points are {points.shape}: expected (N, 3).")
@@ -92,10 +97,19 @@ def _solids(path: Path, blocks: list[Block], points: NDArray[np.float64]) -> lis
     solids = [block for block in blocks if block.dimension == 3 and len(block.nodes)]
     if not solids or any(block.kind not in _HEXAHEDRA for block in solids):
         raise MeshError(f"{path} {_other_cells(blocks, solids, points)}")
-    first = 0
+    first, curved = 0, [np.zeros(0)]
     for block in solids:
-        _check_straight(path, points[block.nodes], first)
+        curved.append(_curving(path, points[block.nodes], first))
         first += len(block.nodes)
+    away = np.concatenate(curved)
+    if len(away):
+        warnings.warn(
+            f"{path}: {len(away)} of {first} cells are curved, with nodes up to {away.max():.3g} m "
+            "away from the places between their corners; the corners alone are used, so that the "
+            "body has straight edges",
+            PdcorrectWarning,
+            stacklevel=3,
+        )
     return solids
 
 
@@ -116,7 +130,7 @@ def _groups(content: Content, used: Integers, cells: Integers) -> dict[str, Grou
         members = content.element_groups.get(name, np.zeros(0, np.int64))
         others = members[(cell[members] < 0) & (face[members] < 0)]
         own = content.node_groups.get(name, np.zeros(0, np.int64))
-        nodes = np.append(own, _nodes_of(content.blocks, others))
+        nodes = np.append(own, nodes_of(content.blocks, others))
         sides = np.stack(np.divmod(_known(face[members]), 6), axis=1)
         out[name] = Group(_known(cell[members]), sides, _known(node[nodes]))
     return out
@@ -125,16 +139,6 @@ def _groups(content: Content, used: Integers, cells: Integers) -> dict[str, Grou
 def _known(numbers: Integers) -> Integers:
     """Those that are not -1, each once."""
     return np.unique(numbers[numbers >= 0])
-
-
-def _nodes_of(blocks: list[Block], elements: Integers) -> Integers:
-    """Nodes (k,) of some elements, which are counted through all blocks."""
-    out, start = [np.zeros(0, np.int64)], 0
-    for block in blocks if len(elements) else ():
-        own = elements[(elements >= start) & (elements < start + len(block.nodes))]
-        out.append(block.nodes[own - start].ravel())
-        start += len(block.nodes)
-    return np.concatenate(out)
 
 
 def _faces(cells: Integers, quads: Integers) -> Integers:
@@ -164,28 +168,33 @@ def _other_cells(blocks: list[Block], solids: list[Block], points: NDArray[np.fl
     )
 
 
-def _check_straight(path: Path, nodes: NDArray[np.float64], first: int) -> None:
-    """Refuse cells whose nodes (C, 8 or 20 or 27, 3) are not where the corners put them, m."""
+def _curving(path: Path, nodes: NDArray[np.float64], first: int) -> NDArray[np.float64]:
+    """How far the nodes (C, 8 or 20 or 27, 3) of curved cells are from between their corners, m.
+
+    Refuses nodes farther away than curving puts them, as if in another order.
+    """
     count = nodes.shape[1]
     if count == 8:
-        return
+        return np.zeros(0)
     expected = np.einsum("kc,nci->nki", _BETWEEN[: count - 8], nodes[:, :8])
     away = np.linalg.norm(nodes[:, 8:] - expected, axis=2)
     if count == 27:  # whose faces Abaqus's programs count differently
         apart = np.linalg.norm(nodes[:, None, 20:] - expected[:, 12:, None], axis=3)
         away[:, 12:] = apart.min(axis=2)
     edges = nodes[:, VTK_EDGES[:, 0]] - nodes[:, VTK_EDGES[:, 1]]
-    size = np.linalg.norm(edges, axis=2).min(axis=1)
-    curved = np.flatnonzero(~(away.max(axis=1) <= TOLERANCE * size))
-    if len(curved):
-        cell = int(curved[0])
+    lengths = np.linalg.norm(edges, axis=2)
+    farthest = away.max(axis=1)
+    wrong = np.flatnonzero(~(farthest <= _CURVED * lengths.max(axis=1)))
+    if len(wrong):
+        cell = int(wrong[0])
         node = int(np.argmax(away[cell]))
         raise MeshError(
             f"{path}: cell {first + cell} around {nodes[cell, :8].mean(axis=0)} has its node "
             f"{8 + node} {away[cell, node]:.3g} m away from the place between its corners "
-            f"({len(curved)} such cells): expected straight-sided cells (in Gmsh: "
+            f"({len(wrong)} such cells): expected at most {_CURVED:g} of an edge (in Gmsh: "
             "`Mesh.ElementOrder = 1`)."
         )
+    return np.asarray(farthest[farthest > TOLERANCE * lengths.min(axis=1)])
 
 
 def write_vtu(

@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 
 from pdcorrect.errors import SceneError
 from pdcorrect.fem.clamps import Selector
+from pdcorrect.fem.elastic_body import ElasticBody
 from pdcorrect.fem.locate import locate
 from pdcorrect.fem.operators import Space
-from pdcorrect.fem.problem import Problem
 from pdcorrect.scene import Probe
 
 Array = NDArray[np.float64]
@@ -19,33 +19,33 @@ _OUTSIDE = 1e-3
 """Of the coarse cell size: how far a point may lie outside the body."""
 
 
-def probe_weights(problem: Problem) -> sp.csr_matrix:
-    """Nodal fields to their values at the scene's probes, (P, N).
+def probe_weights(body: ElasticBody, probes: tuple[Probe, ...]) -> sp.csr_matrix:
+    """Nodal fields to their values at a scene's probes, (P, N).
 
     Raises
     ------
     SceneError
         If a point is outside the body, or a region contains nothing.
     """
-    selector = Selector(problem.mesh, problem.space, problem.cell_size)
+    selector = Selector(body.mesh, body.space, body.cell_size)
     rows = [
-        _at_point(problem, np.array(probe.point), f"probes[{i}]")
+        _at_point(body, np.array(probe.point), f"probes[{i}]")
         if probe.point is not None
-        else _over_region(problem.space, selector, probe, f"probes[{i}].region")
-        for i, probe in enumerate(problem.scene.probes)
+        else _over_region(body.space, selector, probe, f"probes[{i}].region")
+        for i, probe in enumerate(probes)
     ]
-    return sp.csr_matrix(np.array(rows).reshape(-1, len(problem.positions)))
+    return sp.csr_matrix(np.array(rows).reshape(-1, len(body.positions)))
 
 
-def _at_point(problem: Problem, point: Array, key: str) -> Array:
-    cells, local, distances = locate(problem.mesh.positions, problem.mesh.cells, point[None])
-    if distances[0] > _OUTSIDE * problem.cell_size:
+def _at_point(body: ElasticBody, point: Array, key: str) -> Array:
+    cells, local, distances = locate(body.mesh.positions, body.mesh.cells, point[None])
+    if distances[0] > _OUTSIDE * body.cell_size:
         raise SceneError(
             f"{key}.point = {point.tolist()} is {distances[0]:.3g} m outside the body: expected a "
             "point of the body at rest."
         )
-    out = np.zeros(len(problem.positions))
-    out[problem.cells[cells[0]]] = problem.space.shape_functions(local)[0]
+    out = np.zeros(len(body.positions))
+    out[body.cells[cells[0]]] = body.space.shape_functions(local)[0]
     return out
 
 

@@ -28,6 +28,7 @@ from pdcorrect.fem.mesh import HexMesh, warn_of_thin_cells
 from pdcorrect.fem.mesh import refine as refine_mesh
 from pdcorrect.fem.operators import Space, freeze, lumped, mass_matrix
 from pdcorrect.fem.plausibility import warn_of_units
+from pdcorrect.fem.probes import probe_weights
 from pdcorrect.fem.rollers import Rollers
 from pdcorrect.fem.scene_mesh import check_size, scene_mesh
 from pdcorrect.scene import Load, Region, Scene, check_scene, trained_coarse
@@ -327,6 +328,8 @@ def discretise(
     materials = Materials.from_scene(scene, selector, len(refined.cells))
     body = ElasticBody(refined, space, space.quadrature(), materials, cell_size)
     problem = problem_from_body(scene, refine, body)
+    if scene.probes:
+        probe_weights(body, scene.probes)  # what is wrong is told before a run
     warn_of_thin_cells(scene.solver.element, refined, problem.free)
     warn_of_units(scene, body)
     return problem

@@ -1,10 +1,18 @@
-"""VTK files: by meshio what it reads whole, by VTK through pyvista all others."""
+"""VTK files: by meshio what it reads whole, by VTK through pyvista all others.
+
+``python -m pdcorrect.fem.vtk_files FILE TARGET`` is the process in which VTK reads.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import importlib.util
 import io
+import os
 import re
+import subprocess
+import sys
+import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -27,7 +35,7 @@ _KINDS: dict[int, tuple[str, list[int]]] = {
 
 _BEYOND_MESHIO = re.compile(
     rb'vtkLZ4DataCompressor|type="String"|<VTKFile[^>]* version="[2-9]'
-    rb'|type="(StructuredGrid|RectilinearGrid|ImageData)"'
+    rb'|type="(PUnstructuredGrid|StructuredGrid|RectilinearGrid|ImageData)"'
     rb"|^DATASET (UNSTRUCTURED_GRID|STRUCTURED_GRID|STRUCTURED_POINTS|RECTILINEAR_GRID)\s",
     re.MULTILINE,
 )
@@ -35,6 +43,8 @@ _BEYOND_MESHIO = re.compile(
 
 _GHOSTS, _GHOST = "vtkGhostType", 1 | 32
 """VTK's array of cells that another piece has too (1) or that are blanked (32)."""
+_VALUE = "value "
+"""Before the names of arrays of cells, which may be any."""
 
 
 def read_vtk(path: Path) -> Content:
@@ -45,21 +55,26 @@ def read_vtk(path: Path) -> Content:
     MeshError
         If the file is damaged, or needs pyvista, which is missing.
     """
-    head, _, _ = path.read_bytes().partition(b"<AppendedData")
-    pieces = _pieces(head)
+    head = _head(path)
+    sources = re.findall(rb'<Piece\b[^>]*\bSource\s*=\s*"([^"\0]*)"', head)  # of a .pvtu
+    heads = [_head(path.parent / os.fsdecode(source)) for source in sources] or [head]
+    pieces = [piece for each in heads for piece in _pieces(each)]
     try:
         return _by_meshio(path, pieces)
     except _Incomplete as error:
-        return _by_pyvista(path, pieces, str(error))
+        return _by_vtk(path, pieces, str(error))
     except MeshError:
-        # VTK ends the whole program at some damaged files, so it gets none that meshio should read.
         if not _BEYOND_MESHIO.search(head):
             raise
-        return _by_pyvista(path, pieces, "of a kind that it does not know")
+        return _by_vtk(path, pieces, "of a kind that it does not know")
 
 
 class _Incomplete(Exception):
     """What meshio does not read of a file."""
+
+
+def _head(path: Path) -> bytes:
+    return path.read_bytes().partition(b"<AppendedData")[0]
 
 
 def _pieces(head: bytes) -> list[tuple[int, int]]:
@@ -130,81 +145,92 @@ def value_groups(values: Mapping[str, NDArray[Any]]) -> dict[str, Integers]:
     return groups
 
 
-def _by_pyvista(path: Path, pieces: list[tuple[int, int]], reason: str) -> Content:
-    try:
-        import pyvista
-    except ImportError:
+def _by_vtk(path: Path, pieces: list[tuple[int, int]], reason: str) -> Content:
+    """Read a file by VTK in another process, which some damaged files end."""
+    if importlib.util.find_spec("pyvista") is None:
         raise MeshError(
             f"{path}: meshio cannot read it ({reason}). Install pyvista, which can (pip install "
             "'pdcorrect[view]'), or save it in ParaView as one unstructured grid of hexahedra "
             "(.vtu, compressor ZLib or none)."
-        ) from None
-    from vtkmodules.vtkCommonCore import vtkObject
-
-    shown = vtkObject.GetGlobalWarningDisplay()
-    vtkObject.SetGlobalWarningDisplay(0)  # damaged files make VTK print pages
-    try:
-        reader = pyvista.get_reader(path)  # type: ignore[no-untyped-call]
-        grid = reader.read()
-        if not isinstance(grid, pyvista.UnstructuredGrid):
-            grid = grid.cast_to_unstructured_grid()
-        failed = bool(reader.reader.GetErrorCode())
-    except Exception:  # pyvista raises nearly every type on damaged files
-        failed = True
-    finally:
-        vtkObject.SetGlobalWarningDisplay(shown)
-    if failed or not grid.n_cells:
-        raise MeshError(f"{path}: cannot be read by VTK, nor by meshio ({reason}).")
+        )
+    with tempfile.TemporaryDirectory() as folder:
+        target = Path(folder) / "grid.npz"
+        command = [sys.executable, "-m", "pdcorrect.fem.vtk_files", str(path), str(target)]
+        if subprocess.run(command, capture_output=True).returncode != 0:
+            raise MeshError(f"{path}: cannot be read by VTK, nor by meshio ({reason}).")
+        with np.load(target) as file:
+            grid = dict(file)
     wanted = tuple(map(sum, zip(*pieces, strict=True)))
-    if pieces and wanted != (grid.n_points, grid.n_cells):
+    found = len(grid["points"]), len(grid["types"])
+    if pieces and wanted != found:
         raise MeshError(
-            f"{path}: {grid.n_points} points and {grid.n_cells} cells are read of "
+            f"{path}: {found[0]} points and {found[1]} cells are read of "
             f"{wanted[0]} and {wanted[1]} that it says it has."
         )
     return _from_grid(path, grid, [points for points, _ in pieces])
 
 
-def _from_grid(path: Path, grid: Any, pieces: list[int]) -> Content:
-    """Cells of an unstructured grid by type, in their order."""
+def _write_grid(path: str, target: str) -> None:
+    """Have VTK read a file, and write points, cells and whole numbers of cells as NumPy arrays."""
+    import pyvista
     from vtkmodules.util.numpy_support import vtk_to_numpy
+    from vtkmodules.vtkCommonCore import vtkObject
+    from vtkmodules.vtkCommonDataModel import vtkGenericCell
 
-    points = np.array(grid.points, dtype=np.float64) + 0.0  # no -0
-    types, table = np.asarray(grid.celltypes), grid.GetCells()
+    vtkObject.SetGlobalWarningDisplay(0)  # damaged files make VTK print pages
+    reader = pyvista.get_reader(path)  # type: ignore[no-untyped-call]
+    grid = reader.read()
+    if not isinstance(grid, pyvista.UnstructuredGrid):
+        grid = grid.cast_to_unstructured_grid()
+    if reader.reader.GetErrorCode() or not grid.n_cells:
+        sys.exit(1)
+    names, dimensions, cell = [], [], vtkGenericCell()
+    for number in np.unique(grid.celltypes).tolist():
+        cell.SetCellType(number)
+        named = number in pyvista.CellType.__members__.values()
+        names.append(pyvista.CellType(number).name.lower() if named else f"VTK {number}")
+        dimensions.append(cell.GetCellDimension())
+    values = {name: np.asarray(own) for name, own in grid.cell_data.items()}
+    whole: dict[str, Any] = {
+        _VALUE + name: own for name, own in values.items() if own.dtype.kind in "iu"
+    }
+    table = grid.GetCells()
     starts, nodes = (
-        vtk_to_numpy(part).astype(np.int64)  # type: ignore[no-untyped-call]
+        vtk_to_numpy(part)  # type: ignore[no-untyped-call]
         for part in (table.GetOffsetsArray(), table.GetConnectivityArray())
     )
+    np.savez(
+        target, points=grid.points, types=grid.celltypes, starts=starts, nodes=nodes,
+        names=names, dimensions=dimensions, **whole,
+    )  # fmt: skip
+
+
+def _from_grid(path: Path, grid: Mapping[str, NDArray[Any]], pieces: list[int]) -> Content:
+    """Cells of an unstructured grid by type, in their order."""
+    points = grid["points"].astype(np.float64) + 0.0  # no -0
+    types, starts, nodes = (grid[name].astype(np.int64) for name in ("types", "starts", "nodes"))
     points, place = _merged(points, pieces)
-    ghosts = np.asarray(grid.cell_data.get(_GHOSTS, np.zeros(len(types), np.uint8)))
+    values = {name.removeprefix(_VALUE): x for name, x in grid.items() if name.startswith(_VALUE)}
+    real = values.get(_GHOSTS, np.zeros(len(types), np.int64)) & _GHOST == 0
     blocks, order = [], [np.zeros(0, np.int64)]
-    for number in np.unique(types):
-        own = np.flatnonzero((types == number) & (ghosts & _GHOST == 0))
+    for number, name, dimension in zip(
+        np.unique(types), grid["names"], grid["dimensions"], strict=True
+    ):
+        own = np.flatnonzero((types == number) & real)
         sizes = np.diff(starts)[own]
         for size in np.unique(sizes):
             chosen = own[sizes == size]
             rows = nodes[starts[chosen][:, None] + np.arange(size)]
             if rows.size and not 0 <= rows.min() <= rows.max() < len(place):
                 raise MeshError(f"{path}: its cells refer to points that it does not hold.")
-            blocks.append(_block(int(number), place[rows]))
+            kind, nodes_of_kind = _KINDS.get(int(number), ("", []))
+            if len(nodes_of_kind) != size:
+                kind, nodes_of_kind = str(name), list(range(size))
+            blocks.append(Block(kind, int(dimension), place[rows[:, nodes_of_kind]]))
             order.append(chosen)
-    values = {name: np.asarray(grid.cell_data[name]) for name in grid.cell_data}
     chosen = np.concatenate(order)
     groups = value_groups({name: own[chosen] for name, own in values.items()})
     return Content(points, blocks, groups, {})
-
-
-def _block(number: int, nodes: Integers) -> Block:
-    from pyvista import CellType
-    from vtkmodules.vtkCommonDataModel import vtkGenericCell
-
-    cell = vtkGenericCell()
-    cell.SetCellType(number)
-    kind, order = _KINDS.get(number, ("", []))
-    if len(order) != nodes.shape[1]:
-        named = number in CellType.__members__.values()
-        kind = CellType(number).name.lower() if named else f"VTK {number}"
-        order = list(range(nodes.shape[1]))
-    return Block(kind, cell.GetCellDimension(), nodes[:, order])
 
 
 def _merged(points: NDArray[np.float64], pieces: list[int]) -> tuple[NDArray[np.float64], Integers]:
@@ -218,3 +244,7 @@ def _merged(points: NDArray[np.float64], pieces: list[int]) -> tuple[NDArray[np.
         return points, np.arange(len(points))
     merged, place = np.unique(points, axis=0, return_inverse=True)
     return merged, place.ravel()
+
+
+if __name__ == "__main__":
+    _write_grid(*sys.argv[1:])

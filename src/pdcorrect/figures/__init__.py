@@ -37,7 +37,7 @@ from pdcorrect.figures.panels import (
     write_film,
     write_png,
 )
-from pdcorrect.figures.sheet import Sheet, height_of_text
+from pdcorrect.figures.sheet import ColourBar, Sheet, height_of_text
 from pdcorrect.trajectory import Trajectory
 
 __all__ = [
@@ -108,7 +108,7 @@ def render(
         Displacements are drawn that many times as large; obstacles stay.
     section : (str, float), optional
         Axis and place, m: a plane through the body at rest; cells whose centre is on the camera's
-        side of it are left out.
+        side of it are left out, of all bodies of a scene.
 
     Returns
     -------
@@ -131,45 +131,75 @@ def render(
     names = list(labels) if labels is not None else [""] * len(runs)
     shared = _common_frames([*runs, reference] if colour == "error" and reference else runs)
     chosen = shared[:, _choose(frame, shared.shape[1], film)]
-    bodies = [
-        replace(body_of(run, frames, colour, reference, chosen[-1]), obstacles=obstacles_of(run))
-        for run, frames in zip(runs, chosen, strict=False)
-    ]
-    bar = None
-    if colour:
-        bodies, bar = scaled(bodies, colour)
     axes = camera_axes(camera)
+    bodies, bar = _coloured(runs, chosen, colour, reference)
     bodies = [_shown(body, warp, section, axes) for body in bodies]
     count, side = chosen.shape[1], len(runs)
     panels = [(body, time) for time in range(count) for body in range(side)]
     a_page = side if film else len(panels)
     in_rows = film or side == 1 or count == 1
     columns = -(-a_page // -(-a_page // _ROW)) if in_rows else side  # about as many in each row
-    rows, captions = -(-a_page // columns), names + [""] * (a_page - side)
+    captions, rest = names + [""] * (a_page - side), _moves(bodies)
     width, height = size or (window or _usual_width(columns, film), None)
+    view = _view(shown_points(bodies, rest), axes, captions, columns, width, height)
+    longest = max(float(body.run.times[body.frames].max()) for body in bodies)
     font = _font(width, columns)
-    if height is not None:
-        height = _panel_height(height - height_of_text(captions, columns, font), rows, size)
-    rest = _moves(bodies)
-    view = Camera.fitted(shown_points(bodies, rest), max(16, width // columns), axes, height)
-    times = [[float(b.run.times[k]) for k in b.frames] for b in bodies]
-    longest = max(map(max, times))
     sheet = Sheet(view, captions, columns, bar, font, longest=longest, size=size)
     palette, limits = (bar.palette, (bar.low, bar.limit)) if bar else ("viridis", (0.0, 1.0))
     with closing(Painter(bodies, view, palette, limits, rest)) as painter:
-
-        def pages() -> Iterator[Image]:
-            for start in range(0, len(panels), a_page):
-                shown = panels[start : start + a_page]
-                images = [painter.image(body, time) for body, time in shown]
-                yield sheet.page(images, [times[body][time] for body, time in shown])
-
-        with picture_file(output) as part:
-            if film:
-                write_film(part, pages(), fps)
-            else:
-                write_png(part, next(pages()))
+        parts = [panels[start : start + a_page] for start in range(0, len(panels), a_page)]
+        _write(output, (_page(painter, sheet, bodies, part) for part in parts), film, fps)
     return output
+
+
+def _coloured(
+    runs: list[Trajectory],
+    chosen: NDArray[np.int64],
+    colour: Colour | None,
+    reference: Trajectory | None,
+) -> tuple[list[Body], ColourBar | None]:
+    """Runs at their chosen frames (runs, n) as bodies with obstacles, and their colour scale."""
+    bodies = [
+        replace(body_of(run, frames, colour, reference, chosen[-1]), obstacles=obstacles_of(run))
+        for run, frames in zip(runs, chosen, strict=False)
+    ]
+    return scaled(bodies, colour) if colour else (bodies, None)
+
+
+def _view(
+    points: NDArray[np.float64],
+    axes: NDArray[np.float64],
+    captions: Sequence[str],
+    columns: int,
+    width: int,
+    height: int | None,
+) -> Camera:
+    """The camera of panels that fill a width with their captions, and a height if one is given."""
+    if height is not None:
+        rows = -(-len(captions) // columns)
+        room = height - height_of_text(captions, columns, _font(width, columns))
+        if room < 16 * rows:
+            raise InputError(
+                f"size {(width, height)}: expected more room for the bodies beside the text."
+            )
+        height = room // rows
+    return Camera.fitted(points, max(16, width // columns), axes, height)
+
+
+def _page(
+    painter: Painter, sheet: Sheet, bodies: list[Body], panels: list[tuple[int, int]]
+) -> Image:
+    """A sheet of panels, each a body at one of its times."""
+    times = [float(bodies[body].run.times[bodies[body].frames[time]]) for body, time in panels]
+    return sheet.page([painter.image(body, time) for body, time in panels], times)
+
+
+def _write(output: Path, pages: Iterator[Image], film: bool, fps: float) -> None:
+    with picture_file(output) as part:
+        if film:
+            write_film(part, pages, fps)
+        else:
+            write_png(part, next(pages))
 
 
 def render_overlay(
@@ -217,12 +247,6 @@ def render_overlay(
 
 def _usual_width(columns: int, film: bool) -> int:
     return 900 if columns == 1 else _FILM if film else _STILL
-
-
-def _panel_height(room: int, rows: int, size: tuple[int, int] | None) -> int:
-    if room < 16 * rows:
-        raise InputError(f"size {size}: expected more room for the bodies beside the text.")
-    return room // rows
 
 
 def _shown(

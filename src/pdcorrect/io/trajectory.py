@@ -29,7 +29,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from pdcorrect._files import part_of, replacing
+from pdcorrect._files import check_new, part_of, replacing
 from pdcorrect._version import __version__
 from pdcorrect.errors import InputError, OutputError
 from pdcorrect.io.trajectory_reader import (
@@ -50,6 +50,10 @@ __all__ = ["TrajectoryWriter", "load_trajectory", "save_trajectory"]
 _LIBRARY = ("v110", "v110")  # readable by HDF5 1.10 and later; what the swmr mode needs
 _STATUS = h5py.string_dtype("ascii", 32)
 _FILL = {"f": np.nan, "i": -1, "S": b""}
+_REPLACE = (
+    "choose another name, overwrite it with --overwrite (overwrite=True), or continue it with "
+    "--resume (TrajectoryWriter.resume)"
+)
 _REMEDIES = {
     errno.EAGAIN: "It is open in another program: close it, or set HDF5_USE_FILE_LOCKING=FALSE.",
     errno.ENOLCK: "The file system has no locks: set HDF5_USE_FILE_LOCKING=FALSE.",
@@ -110,7 +114,7 @@ class TrajectoryWriter:
             memory={name: array[None] for name, array in initial.memory.items()},
         )
         _refuse(first)
-        _check_target(Path(path), overwrite)
+        check_new(Path(path), overwrite=overwrite, remedy=_REPLACE)
         self._shape, self._time = first.points.shape, initial.time
         self._frames = 0
         self._growing: list[str] = []  # datasets but for times
@@ -392,16 +396,6 @@ def _check_names(stats: Mapping[str, Any], memory: Mapping[str, Any]) -> None:
         expected = "U" if name == "status" else "iubf"
         if name in ("", ".") or "/" in name or kind not in expected:
             raise InputError(f"stats {name!r} of kind {kind!r}: expected numbers, status as text.")
-
-
-def _check_target(path: Path, overwrite: bool) -> None:
-    if path.exists() and not path.is_file():
-        raise OutputError(f"{path}: is a folder, a device or a pipe; give the name of a file.")
-    if path.exists() and not overwrite:
-        raise OutputError(
-            f"{path}: exists already; choose another name, overwrite it with --overwrite "
-            "(overwrite=True), or continue it with --resume (TrajectoryWriter.resume)."
-        )
 
 
 def _entries(state: State, values: Mapping[str, Any]) -> dict[str, Any]:

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from pdcorrect._config import Axis, Count, Direction, Number, Positive, Strict, Vector, as_toml
 from pdcorrect.errors import SceneError
@@ -50,6 +50,13 @@ class Region(Strict):
     group: Annotated[str, Field(min_length=1)] | None = None
     everywhere: Literal[True] | None = None
 
+    @field_validator("box")
+    @classmethod
+    def _in_order(cls, box: tuple[Vector, Vector] | None) -> tuple[Vector, Vector] | None:
+        if box is not None and any(low > high for low, high in zip(*box, strict=True)):
+            raise ValueError("expected box = [lowest corner, highest corner]")
+        return box
+
     @model_validator(mode="after")
     def _exactly_one(self) -> Region:
         names = ("plane", "box", "sphere", "nodes", "group", "everywhere")
@@ -82,7 +89,7 @@ class Region(Strict):
                 at = float(getattr(np, at)(body @ normal))
             return np.asarray(np.abs(points @ normal - at) <= tolerance)
         if self.box is not None:
-            low, high = np.sort(np.asarray(self.box), axis=0)
+            low, high = np.asarray(self.box)
             inside = (points >= low - tolerance) & (points <= high + tolerance)
             return inside.all(axis=1)
         if self.sphere is not None and self.radius is not None:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from pdcorrect._config import parse_toml
 from pdcorrect.errors import ConvergenceError, InputError, MeshError, PdcorrectWarning
+from pdcorrect.fem.clamps import rigid_freedom
 from pdcorrect.fem.hexahedron import gauss_points, jacobians
 from pdcorrect.fem.mesh import coincident_nodes
 from pdcorrect.fem.problem import Problem
@@ -57,7 +58,7 @@ def march(
     if on_failure not in ("raise", "stop", "continue"):
         raise InputError(f"on_failure = {on_failure!r}: expected 'raise', 'stop' or 'continue'.")
     problem = stepper.problem
-    frames = whole("frames", problem.scene.time.frames if frames is None else frames)
+    frames = whole("frames", problem.scene.time.frames if frames is None else frames, 1)
     current = problem.initial_state() if state is None else state
     for frame in range(1, frames + 1):
         started, results = time.perf_counter(), []
@@ -71,7 +72,7 @@ def march(
                     f"{result.iterations} iterations (largest out-of-balance force "
                     f"{result.residual:.3g} N, estimated distance from the solution "
                     f"{result.error_estimate:.3g} m). Use a smaller time step, weaker loads or a "
-                    f"finer mesh{_BLOCKED if problem.contact is not None else ''}.",
+                    f"finer mesh{_of_contact(problem)}.",
                     result=result,
                 )
             current = result.state
@@ -79,7 +80,15 @@ def march(
         yield _of_frame(results), time.perf_counter() - started
 
 
-_BLOCKED = ", and look whether an obstacle meets nodes that are held, or another obstacle"
+def _of_contact(problem: Problem) -> str:
+    """What to look for where there are obstacles, which are expected to hold static bodies."""
+    if problem.contact is None:
+        return ""
+    static = problem.scene.time.integrator == "quasi-static"
+    loose = static and rigid_freedom(problem.positions, problem.cells, problem.clamps)
+    if loose:
+        return f", and look whether obstacles hold the body at all times: {loose}"
+    return ", and look whether an obstacle meets nodes that are held, or another obstacle"
 
 
 def _of_frame(results: list[StepResult]) -> StepResult:
@@ -116,7 +125,7 @@ def rollout(
         Projective dynamics, Newton, or anything that maps a state to a
         `StepResult`.
     frames : int, optional
-        To compute, each of the scene's substeps; the scene's by default.
+        To compute, 1 or more, each of the scene's substeps; the scene's by default.
     state : State, optional
         Where to start; `Problem.initial_state` by default.
     forces : callable, optional

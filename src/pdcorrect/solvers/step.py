@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdcorrect.errors import ConvergenceError, InputError
+from pdcorrect.fem.clamps import rigid_freedom
 from pdcorrect.fem.elastic_body import Linearisation
 from pdcorrect.fem.factorisation import (
     Backend,
@@ -297,10 +298,12 @@ class GlobalSolver:
             try:
                 factor = factorise(matrix[nodes][:, nodes], backend, approximate=True)
             except NotPositiveDefinite as error:
+                loose = rigid_freedom(problem.positions, problem.cells, problem.clamps)
                 raise ConvergenceError(
-                    f"the global matrix of the step is singular to working precision ({error}): "
-                    "expected clamps, or inertia that matters beside the stiffness. Use clamps (a "
-                    "quasi-static problem needs them), a smaller time step or more density."
+                    "the global matrix of the step is singular to working precision "
+                    f"({loose or error}): expected clamps, or inertia that matters beside the "
+                    "stiffness. Use clamps (a quasi-static problem needs them), a smaller time "
+                    "step or more density."
                 ) from None
             self._parts.append((factor, nodes, np.flatnonzero(group.ravel() == i)))
         self._all_free = bool(free.all())
