@@ -92,7 +92,8 @@ def tell_of_compiling() -> None:
 
         def on_start(self, event: object) -> None:
             if not self.done:
-                typer.echo("compiling kernels, which takes a minute or two the first time", err=True)
+                told = "compiling kernels, which takes a minute or two the first time"
+                typer.echo(told, err=True)
             self.done = True
 
         def on_end(self, event: object) -> None:

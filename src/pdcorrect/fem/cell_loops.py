@@ -7,7 +7,7 @@ from typing import Any
 
 import numba
 import numpy as np
-from llvmlite import ir
+from llvmlite import ir  # type: ignore[import-untyped]
 from numba import njit, prange, types
 from numba.extending import intrinsic
 
@@ -30,7 +30,8 @@ class CellLoop:
         self._addresses: dict[tuple[Any, ...], int] = {}
 
     def __call__(self, count: int, *arguments: Any) -> None:
-        if count <= CHUNK or numba.get_num_threads() == 1 or numba.config.DISABLE_JIT:
+        compiled = not numba.config.DISABLE_JIT  # type: ignore[attr-defined]
+        if count <= CHUNK or numba.get_num_threads() == 1 or not compiled:
             self.kernel(0, count, *arguments)
         else:
             _in_threads(self._address(arguments), count, arguments)
@@ -43,7 +44,8 @@ class CellLoop:
         )
         if key not in self._addresses:
             self.kernel(0, 0, *arguments)
-            signature = tuple(numba.typeof(a) for a in (0, 0, *arguments))
+            kinds = (numba.typeof(a) for a in (0, 0, *arguments))  # type: ignore[no-untyped-call]
+            signature = tuple(kinds)
             compiled = self.kernel.overloads[signature]
             name = compiled.fndesc.llvm_cfunc_wrapper_name
             self._addresses[key] = compiled.library.get_pointer_to_function(name)
@@ -68,4 +70,5 @@ def _call(typing, address, begin, end, arguments):  # type: ignore[no-untyped-de
 @njit(parallel=True, **OPTIONS)
 def _in_threads(address, count, arguments):  # type: ignore[no-untyped-def]
     for chunk in prange((count + CHUNK - 1) // CHUNK):
-        _call(address, chunk * CHUNK, min(count, (chunk + 1) * CHUNK), arguments)
+        end = min(count, (chunk + 1) * CHUNK)
+        _call(address, chunk * CHUNK, end, arguments)  # type: ignore[call-arg]
