@@ -92,8 +92,7 @@ def tell_of_compiling() -> None:
 
         def on_start(self, event: object) -> None:
             if not self.done:
-                told = "compiling kernels, which takes a minute or two the first time"
-                typer.echo(told, err=True)
+                typer.echo("compiling kernels: a minute or two, the first time only", err=True)
             self.done = True
 
         def on_end(self, event: object) -> None:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numba
 import numpy as np
-from llvmlite import ir  # type: ignore[import-untyped]
+from llvmlite import ir
 from numba import njit, prange, types
 from numba.extending import intrinsic
 
@@ -30,8 +30,8 @@ class CellLoop:
         self._addresses: dict[tuple[Any, ...], int] = {}
 
     def __call__(self, count: int, *arguments: Any) -> None:
-        compiled = not numba.config.DISABLE_JIT  # type: ignore[attr-defined]
-        if count <= CHUNK or numba.get_num_threads() == 1 or not compiled:
+        plain = numba.config.DISABLE_JIT  # type: ignore[attr-defined]
+        if plain or count <= CHUNK or numba.get_num_threads() == 1:
             self.kernel(0, count, *arguments)
         else:
             _in_threads(self._address(arguments), count, arguments)
@@ -43,9 +43,11 @@ class CellLoop:
             for a in arguments
         )
         if key not in self._addresses:
-            self.kernel(0, 0, *arguments)
-            kinds = (numba.typeof(a) for a in (0, 0, *arguments))  # type: ignore[no-untyped-call]
-            signature = tuple(kinds)
+            signature = tuple(
+                numba.typeof(a)  # type: ignore[no-untyped-call]
+                for a in (0, 0, *arguments)
+            )
+            self.kernel.compile(signature)
             compiled = self.kernel.overloads[signature]
             name = compiled.fndesc.llvm_cfunc_wrapper_name
             self._addresses[key] = compiled.library.get_pointer_to_function(name)
