@@ -68,5 +68,5 @@ SCENES = {
     ),
 }  # fmt: skip
 """A plate squeezed to a fifth, a cube that slides, two that a box pokes, one at half its height."""
-UNDECIDED = "corner on corner"
-"""Slides off to any of three sides."""
+UNDECIDED = "corner on corner", "press", "press, nu 0.49"
+"""Symmetric bodies that slide off or buckle to any of several sides."""

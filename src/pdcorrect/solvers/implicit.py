@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import threading
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import cache
@@ -268,19 +268,20 @@ class ImplicitStepper:
     ) -> _Outcome:
         objective = self.objective(state, forces, h, integrate)
         stage = objective.stage
-        options = replace(self._options, tolerance=self._options.tolerance / stage.gain)
-        minimum = self._settled(objective, objective.start, options)
-        for _ in range(_SADDLES):
-            below = self._below_saddle(objective, minimum)
-            if below is None:
-                break
-            minimum = self._settled(objective, below, options).after(minimum)
+        minimum = self.minimum(objective, objective.start)
         effort.update(iterations=minimum.iterations, evaluations=minimum.evaluations)
         if minimum.status.ok and self._adrift:
             y, gradient = objective.carried(minimum.positions, minimum.gradient)
             minimum = replace(minimum, positions=y, gradient=gradient)
         minimum.estimate *= stage.gain
         return _outcome(self.problem, state, objective, minimum, h)
+
+    def minimum(self, objective: StepObjective, start: Array) -> Minimum:
+        """The minimum of a step's objective that is found from a configuration (N + B, 3)."""
+        within = self._options.tolerance / objective.stage.gain
+        options = replace(self._options, tolerance=within)
+        found = self._settled(objective, start, options)
+        return self._past_saddles(objective, found, lambda y: self._settled(objective, y, options))
 
     def _settled(
         self, objective: StepObjective, start: Array, options: MinimiserOptions
@@ -295,6 +296,17 @@ class ImplicitStepper:
             start,
             lambda y: self._solved(objective, y, options if y is start else again),
         )
+
+    def _past_saddles(
+        self, objective: StepObjective, minimum: Minimum, minimise: Callable[[Array], Minimum]
+    ) -> Minimum:
+        """The minimum that ``minimise`` finds below the saddle where the loop ended, if at one."""
+        for _ in range(_SADDLES):
+            below = self._below_saddle(objective, minimum)
+            if below is None:
+                break
+            minimum = minimise(below).after(minimum)
+        return minimum
 
     def _below_saddle(self, objective: StepObjective, minimum: Minimum) -> Array | None:
         """See `below_saddle`; None too where the loop has looked itself, or contact does not press.
@@ -312,6 +324,10 @@ class ImplicitStepper:
     def _solved(self, objective: StepObjective, start: Array, options: MinimiserOptions) -> Minimum:
         """The method itself, then Newton-CG from where it stopped."""
         found = self._minimise(objective, start, options)
+        if found.status is Status.LINE_SEARCH:
+            found = self._past_saddles(
+                objective, found, lambda y: self._minimise(objective, y, options)
+            )
         if found.status.ok or found.status is Status.NOT_FINITE or not self._recover:
             return found
         options = replace(options, max_iterations=_FALLBACK_ITERATIONS)

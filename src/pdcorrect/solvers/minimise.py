@@ -36,6 +36,8 @@ _PROBE = 1e-3
 """Of the residual of a right-hand side with all modes in it: no negative curvature is met later."""
 _ASIDE = 1e-8
 """Of the terms of gamma: how far it should fall in the first step from a saddle."""
+NEAR_SADDLE = 1e-2 * _ASIDE
+"""The same of a step along the gradient that is not worth while beside that."""
 NO_MOTION = 1e-6
 """Of the tolerance: above this an unmoved first iterate is improved once before it is accepted.
 
@@ -363,9 +365,6 @@ def newton_loop(
         estimate = largest_displacement(step) if exact else math.inf
         if estimate <= options.tolerance and estimate <= objective.trusted(p):
             status = Status.CONVERGED
-            break
-        if not exact and largest_displacement(step) <= options.tolerance:
-            status = Status.LINE_SEARCH  # a saddle
             break
         if iteration == options.max_iterations:
             break

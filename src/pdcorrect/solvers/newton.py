@@ -14,6 +14,7 @@ from pdcorrect.fem.multigrid import Solution, conjugate_gradients
 from pdcorrect.fem.problem import Problem
 from pdcorrect.solvers.implicit import ImplicitStepper, whole
 from pdcorrect.solvers.minimise import (
+    NEAR_SADDLE,
     Direction,
     MinimiserOptions,
     Minimum,
@@ -114,7 +115,10 @@ class Newton(ImplicitStepper):
         def direct(p: Array, gradient: Array) -> tuple[Array, bool]:
             try:
                 solver, exact = self._tangents.factorise(objective, p)
-                return -solver(gradient), exact
+                step = -solver(gradient)
+                if not exact and -np.vdot(gradient, step) <= NEAR_SADDLE * objective.scale:
+                    return np.zeros_like(p), False  # curvature leads down, not the gradient
+                return step, exact
             except NotPositiveDefinite:  # multigrid may notice only when it solves
                 return np.zeros_like(p), False  # no descent: the line search says so
 
