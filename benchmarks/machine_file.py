@@ -16,7 +16,7 @@ DIGITS = 5
 """Significant digits that are kept."""
 
 
-def add(name: str, results: Any, device: str | None = None, **more: Any) -> None:
+def add(name: str, results: Any, device: str | None = None, prefix: str = "", **more: Any) -> None:
     """Put a case's results into the machine's record in place of its earlier ones.
 
     Parameters
@@ -27,12 +27,14 @@ def add(name: str, results: Any, device: str | None = None, **more: Any) -> None
         Rows, or rows by name.
     device : str, optional
         The GPU that was measured, after which the record is called; else it is the processor.
+    prefix : str
+        Of the record's name.
     **more
         Written beside the results.
     """
     machine = environment()
     label = device or f"{machine['processor']} {machine['cores']}cores"
-    path = RESULTS / (re.sub(r"[^a-z0-9]+", "-", label.lower()).strip("-") + ".json")
+    path = RESULTS / f"{prefix}{re.sub('[^a-z0-9]+', '-', label.lower()).strip('-')}.json"
     record = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
     script = Path(sys.argv[0]).name
     record[name] = {
