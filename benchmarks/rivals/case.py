@@ -1,8 +1,8 @@
 """The beam that all contestants simulate, and how a contestant is run; NumPy only.
 
-A contestant is a script with ``SETTINGS``, by name the arguments of its ``simulate(case, law, ...)``,
-which yields the positions of ``case.points`` after each frame.  It runs in the environment of its
-library:
+A contestant is a script with ``SETTINGS``: by name the material law, the meshes (``refine``) and
+further arguments of its ``simulate(case, law, ...)``, which yields the positions of ``case.points``
+after each frame.  It runs in the environment of its library:
 
     python SCRIPT CASE SETTING REFINE OUT.npz
 """
@@ -126,7 +126,8 @@ def main(
     name, setting, refine, out = sys.argv[1:]
     case = Case(name, int(refine))
     wall, cpu, frames = [time.perf_counter()], [time.process_time()], [case.points[case.coarse]]
-    for positions in simulate(case, **settings[setting]):
+    chosen = {key: value for key, value in settings[setting].items() if key != "refine"}
+    for positions in simulate(case, **chosen):
         wall.append(time.perf_counter())
         cpu.append(time.process_time())
         frames.append(np.array(positions, dtype=float)[case.coarse])

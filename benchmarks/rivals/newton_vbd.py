@@ -14,9 +14,11 @@ from case import Case, main
 PACKAGE = "newton"
 SETTINGS = {
     f"{10 / substeps:.3g} ms, {iterations} iterations": {
-        "law": "neo-hookean", "substeps": substeps, "iterations": iterations,
+        "law": "neo-hookean", "substeps": substeps, "iterations": iterations, "refine": refine,
     }
-    for substeps, iterations in ((1, 10), (6, 10), (6, 100), (24, 100))
+    for substeps, iterations, refine in (
+        (1, 10, (1,)), (6, 10, (1, 2)), (6, 100, (1,)), (24, 30, (1,))
+    )
 }  # fmt: skip
 
 
@@ -24,7 +26,7 @@ def simulate(case: Case, law: str, substeps: int, iterations: int) -> Iterator[n
     import newton
     import warp as wp
 
-    builder = newton.ModelBuilder(gravity=0.0)
+    builder = newton.ModelBuilder()
     builder.add_soft_mesh(
         pos=wp.vec3(0.0, 0.0, 0.0), rot=wp.quat_identity(), scale=1.0, vel=wp.vec3(0.0, 0.0, 0.0),
         vertices=[wp.vec3(*point) for point in case.points], indices=case.tets.ravel().tolist(),

@@ -1,4 +1,4 @@
-"""This package, as a contestant."""
+"""A contestant: pdcorrect itself, in the environment that runs the driver."""
 
 from __future__ import annotations
 
@@ -9,15 +9,23 @@ from case import COUNTS, FRAMES, GRAVITY, SIZE, STEP, Case, main
 
 PACKAGE = "pdcorrect"
 
-LAWS = ("corotated", "linear-corotated", "neo-hookean", "st-venant-kirchhoff")
+LAWS = ("linear-corotated", "neo-hookean", "st-venant-kirchhoff")
+_KINDS = (
+    *((e, i, 1, (1,)) for e in ("hex8", "hex27") for i in ("generalised-alpha", "backward-euler")),
+    *((e, "backward-euler", 1, (1,)) for e in ("hex8-enhanced", "hex8-learned")),
+    *((e, "generalised-alpha", 1, (1, 2)) for e in ("hex8-enhanced", "hex8-learned")),
+    *((e, "generalised-alpha", 2, (1,)) for e in ("hex8-enhanced", "hex27")),
+    ("hex8-learned", "generalised-alpha", 2, (1, 2)),
+    ("hex8-learned", "generalised-alpha", 4, (2,)),
+)
+"""Element, integrator, substeps, meshes."""
 SETTINGS = {
-    f"{element}, {label}, {10 // substeps} ms, {law}": {
+    f"{element}, {integrator}, {10 / substeps:g} ms, {law}": {
         "law": law, "element": element, "integrator": integrator, "substeps": substeps,
+        "refine": refine,
     }
     for law in LAWS
-    for element in ("hex8", "hex8-enhanced", "hex8-learned", "hex27")
-    for label, integrator in (("gen.-α", "generalised-alpha"), ("BE", "backward-euler"))
-    for substeps in (1, 2)
+    for element, integrator, substeps, refine in _KINDS
 }  # fmt: skip
 
 

@@ -14,9 +14,11 @@ from case import Case, main
 PACKAGE = "pbatoolkit"
 SETTINGS = {
     f"{10 / substeps:g} ms, {iterations} iterations": {
-        "law": "neo-hookean", "substeps": substeps, "iterations": iterations,
+        "law": "neo-hookean", "substeps": substeps, "iterations": iterations, "refine": refine,
     }
-    for substeps, iterations in ((1, 20), (1, 200), (10, 20), (10, 200), (40, 200))
+    for substeps, iterations, refine in (
+        (1, 20, (1, 2)), (1, 500, (1,)), (10, 20, (1, 2)), (10, 200, (1,)), (40, 20, (1, 2))
+    )
 }  # fmt: skip
 
 

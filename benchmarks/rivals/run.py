@@ -33,7 +33,6 @@ CONTESTANTS = (
     "ours", "mujoco_flex", "pbat_fem", "pbat_vbd", "newton_vbd", "genesis_fem", "simkit_fem",
     "torchfea_fem",
 )  # fmt: skip
-REFINE = (1, 2)
 LIMIT = 240
 """Seconds for a run."""
 QUARTERS = 4
@@ -111,8 +110,8 @@ def main() -> None:
             continue
         versions[name] = version(python, name)
         for case in chosen.cases:
-            for setting in importlib.import_module(name).SETTINGS:
-                for refine in REFINE:
+            for setting, settings in importlib.import_module(name).SETTINGS.items():
+                for refine in settings["refine"]:
                     rows.append(measured(python, name, case, setting, refine))
                     print(rows[-1], flush=True)
     machine_file.add("rivals", rows, prefix="rivals-", versions=versions)

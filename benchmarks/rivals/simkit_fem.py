@@ -15,9 +15,12 @@ PACKAGE = "simkit"
 SETTINGS = {
     f"{scheme}, {10 / substeps:g} ms, {newton} Newton": {
         "law": "neo-hookean", "scheme": scheme, "substeps": substeps, "newton": newton,
+        "refine": refine,
     }
-    for scheme in ("BE", "BDF2")
-    for substeps, newton in ((1, 1), (1, 20), (4, 20))
+    for scheme, substeps, newton, refine in (
+        ("BE", 1, 1, (1, 2)), ("BE", 1, 20, (1,)), ("BDF2", 1, 1, (1,)), ("BDF2", 1, 20, (1, 2)),
+        ("BDF2", 4, 20, (1,)),
+    )
 }  # fmt: skip
 
 
