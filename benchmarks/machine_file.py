@@ -32,9 +32,7 @@ def add(name: str, results: Any, device: str | None = None, prefix: str = "", **
     **more
         Written beside the results.
     """
-    machine = environment()
-    label = device or f"{machine['processor']} {machine['cores']}cores"
-    path = RESULTS / f"{prefix}{re.sub('[^a-z0-9]+', '-', label.lower()).strip('-')}.json"
+    machine, path = environment(), _path(device, prefix)
     record = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
     script = Path(sys.argv[0]).name
     record[name] = {
@@ -47,6 +45,19 @@ def add(name: str, results: Any, device: str | None = None, prefix: str = "", **
     RESULTS.mkdir(exist_ok=True)
     path.write_text(text(record), encoding="utf-8")
     print(f"wrote {path}")
+
+
+def read(name: str, prefix: str = "") -> dict[str, Any]:
+    """What this machine's record has of a case; empty if nothing."""
+    path = _path(None, prefix)
+    record = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+    return dict(record.get(name, {}))
+
+
+def _path(device: str | None, prefix: str) -> Path:
+    machine = environment()
+    label = device or f"{machine['processor']} {machine['cores']}cores"
+    return RESULTS / f"{prefix}{re.sub('[^a-z0-9]+', '-', label.lower()).strip('-')}.json"
 
 
 def text(record: Any, depth: int = 0) -> str:

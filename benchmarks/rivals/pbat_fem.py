@@ -13,14 +13,15 @@ import numpy as np
 from case import Case, main
 
 PACKAGE = "pbatoolkit"
+RECOMMENDED = ("4 nodes, 10 ms, 1 Newton", "10 nodes, 10 ms, 1 Newton")
 SETTINGS = {
     f"{nodes} nodes, {10 / substeps:g} ms, {steps} Newton": {
         "law": "neo-hookean", "nodes": nodes, "substeps": substeps, "steps": steps,
         "refine": refine,
     }
     for nodes, substeps, steps, refine in (
-        (4, 1, 1, (1, 2)), (4, 1, 20, (1,)), (4, 10, 1, (1, 2)),
-        (10, 1, 1, (1, 2)), (10, 1, 20, (1,)), (10, 4, 1, (1,)), (10, 10, 1, (1,)),
+        (4, 1, 1, (1, 2)), (4, 10, 1, (1,)),
+        (10, 1, 1, (1,)), (10, 1, 20, (1,)), (10, 4, 1, (1,)), (10, 10, 1, (1,)),
     )
 }  # fmt: skip
 ENOUGH = 1e-7

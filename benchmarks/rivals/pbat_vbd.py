@@ -12,13 +12,12 @@ import numpy as np
 from case import Case, main
 
 PACKAGE = "pbatoolkit"
+RECOMMENDED = ("10 ms, 20 iterations",)
 SETTINGS = {
     f"{10 / substeps:g} ms, {iterations} iterations": {
         "law": "neo-hookean", "substeps": substeps, "iterations": iterations, "refine": refine,
     }
-    for substeps, iterations, refine in (
-        (1, 20, (1, 2)), (1, 500, (1,)), (10, 20, (1, 2)), (10, 200, (1,)), (40, 20, (1, 2))
-    )
+    for substeps, iterations, refine in ((1, 20, (1, 2)), (10, 20, (1, 2)), (10, 200, (1,)))
 }  # fmt: skip
 
 

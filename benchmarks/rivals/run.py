@@ -3,7 +3,8 @@
     python benchmarks/rivals/run.py FOLDER [--only CONTESTANT ...] [--cases CASE ...]
 
 FOLDER/CONTESTANT/bin/python is the environment of each contestant (the docstring of its script says
-what to install); those without one are left out.  Errors are RMS distances of the coarse nodes to
+what to install); those without one are left out.  Earlier rows of other contestants and cases stay.
+Errors are RMS distances of the coarse nodes to
 the converged motion of the contestant's own material law, over its RMS displacement.
 """
 
@@ -11,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import itertools
 import os
 import subprocess
 import sys
@@ -33,7 +35,8 @@ CONTESTANTS = (
     "ours", "mujoco_flex", "pbat_fem", "pbat_vbd", "newton_vbd", "genesis_fem", "simkit_fem",
     "torchfea_fem",
 )  # fmt: skip
-LIMIT = 240
+NAME, PREFIX = "rivals", "rivals-"
+LIMIT = 150
 """Seconds for a run."""
 QUARTERS = 4
 """Parts of the time for which an error is given each."""
@@ -64,8 +67,12 @@ def errors(positions: np.ndarray, exact: np.ndarray) -> dict[str, Any]:
 
 def measured(python: Path, name: str, case: str, setting: str, refine: int) -> dict[str, Any]:
     """Errors and times of one run in a process of its own."""
-    law = importlib.import_module(name).SETTINGS[setting]["law"]
-    row = {"contestant": name, "case": case, "law": law, "setting": setting, "refine": refine}
+    module = importlib.import_module(name)
+    law = module.SETTINGS[setting]["law"]
+    row = {
+        "contestant": name, "case": case, "law": law, "setting": setting, "refine": refine,
+        "recommended": setting in module.RECOMMENDED,
+    }  # fmt: skip
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "run.npz"
         command = ["taskset", "-c", "0", str(python), str(HERE / f"{name}.py")]
@@ -102,19 +109,20 @@ def main() -> None:
     parser.add_argument("--only", nargs="+", default=CONTESTANTS, choices=CONTESTANTS)
     parser.add_argument("--cases", nargs="+", default=CASES, choices=CASES)
     chosen = parser.parse_args()
-    rows, versions = [], {}
-    for name in chosen.only:
+    record = machine_file.read(NAME, PREFIX)
+    rows, versions = record.get("results", []), record.get("versions", {})
+    for name, case in itertools.product(chosen.only, chosen.cases):
         python = Path(sys.executable) if name == "ours" else chosen.folder / name / "bin/python"
         if not python.exists():
             print(f"{name}: no {python}, left out")
             continue
         versions[name] = version(python, name)
-        for case in chosen.cases:
-            for setting, settings in importlib.import_module(name).SETTINGS.items():
-                for refine in settings["refine"]:
-                    rows.append(measured(python, name, case, setting, refine))
-                    print(rows[-1], flush=True)
-    machine_file.add("rivals", rows, prefix="rivals-", versions=versions)
+        rows = [row for row in rows if (row["contestant"], row["case"]) != (name, case)]
+        for setting, settings in importlib.import_module(name).SETTINGS.items():
+            for refine in settings["refine"]:
+                rows.append(measured(python, name, case, setting, refine))
+                print(rows[-1], flush=True)
+        machine_file.add(NAME, rows, prefix=PREFIX, versions=versions)
 
 
 if __name__ == "__main__":

@@ -12,14 +12,14 @@ import numpy as np
 from case import Case, main
 
 PACKAGE = "simkit"
+RECOMMENDED = ("BE, 10 ms, 1 Newton",)
 SETTINGS = {
     f"{scheme}, {10 / substeps:g} ms, {newton} Newton": {
         "law": "neo-hookean", "scheme": scheme, "substeps": substeps, "newton": newton,
         "refine": refine,
     }
     for scheme, substeps, newton, refine in (
-        ("BE", 1, 1, (1, 2)), ("BE", 1, 20, (1,)), ("BDF2", 1, 1, (1,)), ("BDF2", 1, 20, (1, 2)),
-        ("BDF2", 4, 20, (1,)),
+        ("BE", 1, 1, (1, 2)), ("BE", 1, 20, (1,)), ("BDF2", 1, 20, (1, 2)),
     )
 }  # fmt: skip
 
