@@ -13,10 +13,9 @@ RECOMMENDED = ()
 LAWS = ("linear-corotated", "neo-hookean")
 _KINDS = (
     ("hex8", "generalised-alpha", 1, (1,)),
-    ("hex8-enhanced", "backward-euler", 1, (1,)),
     ("hex8-enhanced", "generalised-alpha", 1, (1, 2)),
     ("hex8-learned", "backward-euler", 1, (1,)),
-    ("hex8-learned", "generalised-alpha", 1, (1, 2)),
+    ("hex8-learned", "generalised-alpha", 1, (1,)),
     ("hex8-learned", "generalised-alpha", 2, (1,)),
     ("hex27", "generalised-alpha", 1, (1,)),
     ("hex27", "generalised-alpha", 2, (1,)),
