@@ -17,6 +17,7 @@ _KINDS = (
     ("hex8-learned", "backward-euler", 1, (1,)),
     ("hex8-learned", "generalised-alpha", 1, (1,)),
     ("hex8-learned", "generalised-alpha", 2, (1,)),
+    ("hex8-learned", "generalised-alpha", 4, (1,)),
     ("hex27", "generalised-alpha", 1, (1,)),
     ("hex27", "generalised-alpha", 2, (1,)),
 )

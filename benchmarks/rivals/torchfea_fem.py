@@ -91,6 +91,8 @@ def simulate(case: Case, law: str, element: str, substeps: int) -> Iterator[np.n
         for _ in range(substeps):
             ahead = x + h * v + h**2 / 4 * a
             new = solver._solve_iteration(GC0=x, GC_pre=ahead, deltaT=h, tol_error=solver.tol_error)
+            if new is False:
+                raise RuntimeError("its Newton's method does not reach its tolerance")
             v, a = solver.get_next_velocity(GC_now=new, GC0=x, GV0=v, GA0=a, deltaT=h)
             x = new
         moved = assembly._GC2RGC(x)[0].numpy()
