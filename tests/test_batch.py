@@ -124,7 +124,9 @@ def test_the_signed_svd_is_the_same_as_numbas():
         assert (np.linalg.det(Q) > 0).all()
 
 
-@pytest.mark.parametrize("energy", ["corotated", "neo-hookean", "st-venant-kirchhoff"])
+@pytest.mark.parametrize(
+    "energy", ["corotated", "neo-hookean", "st-venant-kirchhoff", "linear-corotated"]
+)
 def test_stress_and_tangent_at_points_are_those_of_the_energies(energy):
     F = matrices()
     F = F[np.abs(np.linalg.det(F)) > 1e-3]  # off the kinks

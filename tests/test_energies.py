@@ -24,7 +24,7 @@ CASES = {
 WEIGHTS = {"corotated": (1.0, 0.0), "volume": (0.0, 1.0), "both": (1.0, 3.0)}
 
 
-OTHERS = ("neo-hookean", "st-venant-kirchhoff")
+OTHERS = ("neo-hookean", "st-venant-kirchhoff", "linear-corotated")
 
 
 def taylor_slope(remainder, steps=(1e-3, 5e-4)):
@@ -174,6 +174,10 @@ def literal_density(F, mu, lam, energy):
     if energy == "neo-hookean":
         squares = (F**2).sum(axis=(-2, -1)) - 3
         return mu / 2 * squares - mu * (J - 1) + (mu + lam) / 2 * (J - 1) ** 2
+    if energy == "linear-corotated":
+        stretches = np.linalg.svd(F, compute_uv=False)
+        stretches[..., 2] *= np.sign(J)
+        return mu * ((stretches - 1) ** 2).sum(-1) + lam / 2 * (stretches - 1).sum(-1) ** 2
     strain = 0.5 * (np.swapaxes(F, -1, -2) @ F - identity)
     trace = np.trace(strain, axis1=-2, axis2=-1)
     return mu * (strain**2).sum(axis=(-2, -1)) + lam / 2 * trace**2

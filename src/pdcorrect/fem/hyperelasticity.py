@@ -11,11 +11,15 @@ lambda = lambda + mu, so that small strains give the Lame parameters asked for):
 
     mu |E|^2 + lambda/2 tr(E)^2
 
+"linear-corotated", with F = R S, Hooke's law in the frame that turns with R:
+
+    mu |S - I|^2 + lambda/2 tr(S - I)^2
+
 ARAP is the corotated energy without its volume term.  In the frame of the SVD an
 isotropic tangent is one 3x3 block for the diagonal and, for each pair i, j with
 principal stresses t, the modes (t_i - t_j)/(s_i - s_j) and (t_i + t_j)/(s_i + s_j)
-(Stomakhin et al. 2012).  Both quotients are polynomials here, so nothing special
-happens at repeated or opposite stretches.
+(Stomakhin et al. 2012).  Both quotients are polynomials for the first two, so nothing special
+happens at repeated or opposite stretches; the third has corotated energy's kink.
 
 The functions in `ENERGIES` are of numbers, for the kernels, and of tensors, for batches: stretches
 (3), mu and lambda to the density and the principal stresses (3), and to the tangent (12) with rows
@@ -32,8 +36,11 @@ from numba import njit
 from pdcorrect.errors import InputError
 from pdcorrect.fem.decomposition import OPTIONS
 
-COROTATED, NEO_HOOKEAN, ST_VENANT_KIRCHHOFF = 0, 1, 2
+COROTATED, NEO_HOOKEAN, ST_VENANT_KIRCHHOFF, LINEAR_COROTATED = 0, 1, 2, 3
 """What the kernels call the energies."""
+
+_KINK = 1e-9
+"""Sum of two stretches below which the mode that R makes infinite goes to zero."""
 
 _CODES = {
     "corotated": COROTATED,
@@ -42,6 +49,7 @@ _CODES = {
     "volume-only": COROTATED,
     "neo-hookean": NEO_HOOKEAN,
     "st-venant-kirchhoff": ST_VENANT_KIRCHHOFF,
+    "linear-corotated": LINEAR_COROTATED,
 }
 
 
@@ -105,11 +113,33 @@ def st_venant_kirchhoff_tangent(s, mu, lam):  # type: ignore[no-untyped-def]
     )  # fmt: skip
 
 
+def linear_corotated(s, mu, lam):  # type: ignore[no-untyped-def]
+    x, y, z = s[0] - 1.0, s[1] - 1.0, s[2] - 1.0
+    pressure, twice = lam * (x + y + z), 2.0 * mu
+    density = mu * (x * x + y * y + z * z) + 0.5 * pressure * (x + y + z)
+    return density, (twice * x + pressure, twice * y + pressure, twice * z + pressure)
+
+
+def linear_corotated_tangent(s, mu, lam):  # type: ignore[no-untyped-def]
+    a, b, c = s
+    twice = 2.0 * mu
+    whole = twice + lam
+    rest = 2.0 * lam * (a + b + c - 3.0) - 2.0 * twice
+    ab, ac, bc = a + b, a + c, b + c
+    return (
+        whole, whole, whole, lam, lam, lam, twice, twice, twice,
+        twice + rest * ab / (ab * ab + _KINK * _KINK),
+        twice + rest * ac / (ac * ac + _KINK * _KINK),
+        twice + rest * bc / (bc * bc + _KINK * _KINK),
+    )  # fmt: skip
+
+
 ENERGIES: dict[int, tuple[Callable[..., Any], Callable[..., Any]]] = {
     NEO_HOOKEAN: (neo_hookean, neo_hookean_tangent),
     ST_VENANT_KIRCHHOFF: (st_venant_kirchhoff, st_venant_kirchhoff_tangent),
+    LINEAR_COROTATED: (linear_corotated, linear_corotated_tangent),
 }
-(_neo, _neo_tangent), (_venant, _venant_tangent) = (
+(_neo, _neo_tangent), (_venant, _venant_tangent), (_linear, _linear_tangent) = (
     [njit(**OPTIONS)(function) for function in functions] for functions in ENERGIES.values()
 )
 
@@ -121,8 +151,10 @@ def hyperelastic_lanes(model, s, mu, omega, density, t):  # type: ignore[no-unty
         stretches, lam = (s[0, l], s[1, l], s[2, l]), omega[l] / 3.0
         if model == NEO_HOOKEAN:
             density[l], stress = _neo(stretches, mu[l], lam)
-        else:
+        elif model == ST_VENANT_KIRCHHOFF:
             density[l], stress = _venant(stretches, mu[l], lam)
+        else:
+            density[l], stress = _linear(stretches, mu[l], lam)
         t[0, l], t[1, l], t[2, l] = stress
 
 
@@ -133,7 +165,9 @@ def hyperelastic_tangent_lanes(model, s, mu, omega, T):  # type: ignore[no-untyp
         stretches, lam = (s[0, l], s[1, l], s[2, l]), omega[l] / 3.0
         if model == NEO_HOOKEAN:
             tangent = _neo_tangent(stretches, mu[l], lam)
-        else:
+        elif model == ST_VENANT_KIRCHHOFF:
             tangent = _venant_tangent(stretches, mu[l], lam)
+        else:
+            tangent = _linear_tangent(stretches, mu[l], lam)
         for i in range(12):
             T[i, l] = tangent[i]

@@ -11,8 +11,9 @@ from pdcorrect._config import Poisson, Positive, Strict
 from pdcorrect.scene.regions import Region
 
 Energy = Literal[
-    "corotated", "corotated-only", "arap", "volume-only", "neo-hookean", "st-venant-kirchhoff"
-]
+    "corotated", "corotated-only", "arap", "volume-only",
+    "neo-hookean", "st-venant-kirchhoff", "linear-corotated",
+]  # fmt: skip
 Moduli = TypeVar("Moduli", float, NDArray[np.float64])
 
 
@@ -49,8 +50,8 @@ class Material(Strict):
     ----------
     energy
         "corotated" (both terms), "corotated-only" (also called "arap") or
-        "volume-only"; "neo-hookean" (stable) and "st-venant-kirchhoff", see
-        `pdcorrect.fem.hyperelasticity`.
+        "volume-only"; "neo-hookean" (stable), "st-venant-kirchhoff" and
+        "linear-corotated", see `pdcorrect.fem.hyperelasticity`.
     volume_weight
         "lame": omega = 3 lambda, which gives the E and nu asked for.
         "published": omega = lambda, DiffPD's rule.
