@@ -4,7 +4,8 @@ VENV := .venv
 BIN := $(VENV)/bin
 # Processes that share the tests, of one thread each.
 JOBS ?= 2
-INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
+# Python compiles what is imported when it is, which is a small part of what is installed.
+INSTALL := $(BIN)/python -m pip install --quiet --no-compile --disable-pip-version-check -c constraints.txt
 
 .PHONY: demo demo-learn test test-slow lint docs bench clean
 

@@ -429,6 +429,15 @@ def test_an_energy_without_a_volume_term_stays_without():
     assert furthest(exact, found[0]) < 1e-9
 
 
+@pytest.fixture(scope="module")
+def named():
+    """A stepper of two scenes with names, its state at rest and a step from there."""
+    problems = [pc.discretise(beam((n, 1, 1), poisson=0.3, name=f"n{n}")) for n in (2, 3)]
+    stepper = pc.BatchStepper(problems, 1e-9)
+    rest = stepper.rest_state()
+    return stepper, rest, stepper(rest)
+
+
 @pytest.mark.parametrize(
     ("name", "value"),
     [
@@ -436,11 +445,8 @@ def test_an_energy_without_a_volume_term_stays_without():
         ("density", np.nan), ("poisson", -0.2), ("poisson", 0.5), ("poisson", np.nan),
     ],
 )  # fmt: skip
-def test_materials_out_of_range_are_refused_and_leave_the_stepper_alone(name, value):
-    problems = [pc.discretise(beam((n, 1, 1), poisson=0.3, name=f"n{n}")) for n in (2, 3)]
-    stepper = pc.BatchStepper(problems, 1e-9)
-    rest = stepper.rest_state()
-    expected = stepper(rest)
+def test_materials_out_of_range_are_refused_and_leave_the_stepper_alone(name, value, named):
+    stepper, rest, expected = named
     good = {"young": 1e6, "poisson": 0.3, "density": 1e3}[name]
     given = torch.tensor([[good], [value]], dtype=torch.float64)
     message = rf"{name} of cell 0 in scene 1 \('n3'\) is .*: expected a finite number"

@@ -19,6 +19,7 @@ def scene(**changes):
     return beam((5, 1, 2), solver={"element": "hex8-enhanced", "mass": "averaged"}, **changes)
 
 
+@pytest.mark.slow  # a minute; freer bodies are learned below, and their weights read
 def test_a_body_is_learned_and_the_scene_reads_its_weights(tmp_path):
     """Its two lowest frequencies come nearer to those of 4 x 4 x 4 cells."""
     ends = [{"region": {"plane": "x", "at": end}} for end in ("min", "max")]

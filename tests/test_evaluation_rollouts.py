@@ -247,7 +247,7 @@ def shorter(tmp_path_factory):
     return folder
 
 
-@pytest.mark.parametrize("gate", [None, pc.Gate()])
+@pytest.mark.parametrize("gate", [pytest.param(None, marks=pytest.mark.slow), pc.Gate()])
 def test_scenes_alone_are_evaluated_as_in_a_batch(shorter, gate):
     """Which a CPU does, since it is quicker: to the tolerance of the coarse solver."""
     (saved,) = saved_candidates(["tiny"], gate=gate)

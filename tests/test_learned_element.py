@@ -28,6 +28,7 @@ from pdcorrect.solvers.integrators import backward_euler
 from pdcorrect.solvers.step import StepObjective
 
 OUTPUTS = 171 + 28
+DAMPINGS = [{}, {"stiffness": 1e-3, "viscosity": 1e-3}, {"mass": 3.0}]
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -299,9 +300,7 @@ def test_one_plane_of_symmetry_an_axis():
     assert moved.correction.learned.sum() == 6  # a plane that moves is none of symmetry
 
 
-@pytest.mark.parametrize(
-    "damping", [{}, {"mass": 3.0}, {"stiffness": 1e-3}, {"viscosity": 1e-3}], ids=str
-)
+@pytest.mark.parametrize("damping", DAMPINGS, ids=str)
 def test_derivatives_by_the_material(damping):
     """Of a step from a moving state, cell by cell, through what the network sees."""
     rollers = [{"region": {"plane": "z", "at": "max"}, "components": ["z"]}]
@@ -412,9 +411,7 @@ def test_viscosity_takes_energy_however_soft_the_matrices(poisson, rng):
         assert viscous.loss(problem.relaxed(x + h * v), h) > 0.0
 
 
-@pytest.mark.parametrize(
-    "damping", [{}, {"mass": 3.0}, {"stiffness": 1e-3}, {"viscosity": 1e-3}], ids=str
-)
+@pytest.mark.parametrize("damping", DAMPINGS, ids=str)
 def test_derivatives_by_the_matrices(damping):
     problem = learned_problem(beam((3, 2, 2), damping=damping))
     rng = np.random.default_rng(10)
@@ -523,7 +520,7 @@ def batch_of_two(damping):
     return problems, pc.BatchStepper(problems, 1e-10)
 
 
-@pytest.mark.parametrize("damping", [{}, {"viscosity": 1e-3}, {"stiffness": 1e-3}], ids=str)
+@pytest.mark.parametrize("damping", DAMPINGS[:2], ids=str)
 def test_batches_equal_single_steps(damping):
     problems, stepper = batch_of_two(damping)
     state = stepper.rest_state()
@@ -534,9 +531,7 @@ def test_batches_equal_single_steps(damping):
         assert state.positions[i, : len(single)].numpy() == pytest.approx(single, abs=1e-10)
 
 
-@pytest.mark.parametrize(
-    "damping", [{}, {"mass": 3.0}, {"stiffness": 1e-3}, {"viscosity": 1e-3}], ids=str
-)
+@pytest.mark.parametrize("damping", DAMPINGS, ids=str)
 def test_derivatives_of_batches_equal_those_of_single_steps(damping):
     problems, batch = batch_of_two(damping)
     before = batch(batch.rest_state()).state

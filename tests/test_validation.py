@@ -24,8 +24,22 @@ def check(name, quick):
     assert outside(figures, CASES[name].expected, quick) == []
 
 
-COVERED = {"time_orders", "energy"}
-"""By test_integrators and test_loads_in_time, and by test_energy_balance."""
+COVERED = {
+    "breakdown": "test_integrators, test_steppers",
+    "columns": "test_initial, test_integrators",
+    "damping": "test_viscosity, test_energy_balance, test_integrators",
+    "energy": "test_energy_balance",
+    "error_time": "test_compare",
+    "four_errors": "test_integrators, test_convergence_orders, test_metrics",
+    "gallery": "test_examples, which runs its scenes by both solvers",
+    "newton": "test_steppers, test_elements",
+    "stress": "test_robustness, test_recovery, test_thin_cells",
+    "time_error": "test_integrators",
+    "time_orders": "test_integrators, test_loads_in_time",
+    "unlike_bodies": "test_converged, test_error_estimate",
+    "unlike_families": "test_converged, test_error_estimate",
+}
+"""Quick parts whose behaviour smaller tests have, and which."""
 
 
 @pytest.mark.parametrize(
