@@ -9,7 +9,7 @@ INSTALL := $(BIN)/python -m pip install --quiet --no-compile --disable-pip-versi
 
 .PHONY: demo demo-learn test test-slow lint docs bench clean
 
-demo: $(VENV)/view.stamp $(VENV)/learn.stamp
+demo: $(VENV)/demo.stamp
 	$(BIN)/pdcorrect compare examples/unseen_cross.toml --model torsion-exact --converged --frames 20 -o demo
 
 demo-learn: $(VENV)/learn.stamp
@@ -46,9 +46,9 @@ clean:
 $(VENV)/bin/python:
 	$(PYTHON) -m venv $(VENV)
 
-$(VENV)/view.stamp: pyproject.toml constraints.txt | $(VENV)/bin/python
-	$(INSTALL) -e ".[view]"
-	@touch $@
+$(VENV)/demo.stamp: pyproject.toml constraints.txt | $(VENV)/bin/python
+	$(INSTALL) -e ".[view,learn]"
+	@touch $(VENV)/learn.stamp $@
 
 $(VENV)/learn.stamp: pyproject.toml constraints.txt | $(VENV)/bin/python
 	$(INSTALL) -e ".[learn]"
@@ -56,4 +56,4 @@ $(VENV)/learn.stamp: pyproject.toml constraints.txt | $(VENV)/bin/python
 
 $(VENV)/dev.stamp: pyproject.toml constraints.txt | $(VENV)/bin/python
 	$(INSTALL) -e ".[view,learn,cluster,dev]"
-	@touch $(VENV)/view.stamp $(VENV)/learn.stamp $@
+	@touch $(VENV)/demo.stamp $(VENV)/learn.stamp $@
