@@ -18,11 +18,11 @@ demo-learn: $(VENV)/learn.stamp
 
 # Kernels are compiled once and beside the linters, not by each process of the tests.
 test: $(VENV)/dev.stamp
-	$(MAKE) --jobs=$(JOBS) kernels-trilinear kernels-modes lint
+	$(MAKE) --jobs=3 kernels-trilinear kernels-modes lint
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m "not slow" -n $(JOBS) --dist loadfile --no-loadscope-reorder
 
 test-slow: $(VENV)/dev.stamp
-	$(MAKE) --jobs=$(JOBS) kernels-trilinear kernels-modes
+	$(MAKE) --jobs=2 kernels-trilinear kernels-modes
 	$(BIN)/python -m pytest -m slow
 
 kernels-%: $(VENV)/dev.stamp

@@ -5,6 +5,8 @@
 
 import sys
 
+import numpy as np
+
 import pdcorrect as pc
 from conftest import beam
 
@@ -26,10 +28,16 @@ def trilinear():
 
 
 def modes():
-    problem = pc.discretise(pc.best_coarse(beam(SMALL, damping=DAMPING)))
-    problem.relaxed(problem.positions)  # the longest one, which the other process needs last
-    step(problem)
-    step(pc.discretise(pc.learned_coarse(beam(SMALL, damping=DAMPING))))
+    best, learned = (
+        pc.discretise(choose(beam(SMALL, damping=DAMPING)))
+        for choose in (pc.best_coarse, pc.learned_coarse)
+    )
+    best.relaxed(best.positions)  # first what the other process does not compile
+    u = np.zeros_like(learned.positions)
+    for function in ("strains", "energy_and_forces", "tangent"):
+        getattr(learned.correction, function)(u)
+    for problem in (best, learned):
+        step(problem)
 
 
 if __name__ == "__main__":
