@@ -1,5 +1,6 @@
 """Scenes and meshes that several tests share; all asymmetric on purpose."""
 
+import gc
 import os
 import sys
 from dataclasses import replace
@@ -36,6 +37,11 @@ GRAVITY = [{"kind": "gravity", "acceleration": [0.0, 0.0, -9.81]}]
 
 def pytest_collection_modifyitems(items):
     items.sort(key=lambda item: item.path.stem not in LONG)
+
+
+def pytest_collection_finish():
+    """What modules hold stays, and collections of garbage, a tenth of the time, leave it out."""
+    gc.freeze()
 
 
 def beam(cells=(6, 2, 2), cell_size=0.02, poisson=0.45, **changes):
