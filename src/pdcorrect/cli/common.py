@@ -78,7 +78,7 @@ def tell_of_compiling() -> None:
 
         def on_start(self, event: object) -> None:
             if not self.done:
-                typer.echo("compiling kernels, which takes a minute or two the first time", err=True)
+                typer.echo("compiling kernels: a minute or two, the first time only", err=True)
             self.done = True
 
         def on_end(self, event: object) -> None:

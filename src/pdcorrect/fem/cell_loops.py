@@ -42,8 +42,8 @@ class CellLoop:
             for a in arguments
         )
         if key not in self._addresses:
-            self.kernel(0, 0, *arguments)
             signature = tuple(numba.typeof(a) for a in (0, 0, *arguments))
+            self.kernel.compile(signature)
             compiled = self.kernel.overloads[signature]
             name = compiled.fndesc.llvm_cfunc_wrapper_name
             self._addresses[key] = compiled.library.get_pointer_to_function(name)
