@@ -30,7 +30,8 @@ class CellLoop:
         self._addresses: dict[tuple[Any, ...], int] = {}
 
     def __call__(self, count: int, *arguments: Any) -> None:
-        if count <= CHUNK or numba.get_num_threads() == 1 or numba.config.DISABLE_JIT:
+        plain = numba.config.DISABLE_JIT  # type: ignore[attr-defined]
+        if plain or count <= CHUNK or numba.get_num_threads() == 1:
             self.kernel(0, count, *arguments)
         else:
             _in_threads(self._address(arguments), count, arguments)
@@ -42,7 +43,10 @@ class CellLoop:
             for a in arguments
         )
         if key not in self._addresses:
-            signature = tuple(numba.typeof(a) for a in (0, 0, *arguments))
+            signature = tuple(
+                numba.typeof(a)  # type: ignore[no-untyped-call]
+                for a in (0, 0, *arguments)
+            )
             self.kernel.compile(signature)
             compiled = self.kernel.overloads[signature]
             name = compiled.fndesc.llvm_cfunc_wrapper_name
@@ -68,4 +72,5 @@ def _call(typing, address, begin, end, arguments):  # type: ignore[no-untyped-de
 @njit(parallel=True, **OPTIONS)
 def _in_threads(address, count, arguments):  # type: ignore[no-untyped-def]
     for chunk in prange((count + CHUNK - 1) // CHUNK):
-        _call(address, chunk * CHUNK, min(count, (chunk + 1) * CHUNK), arguments)
+        end = min(count, (chunk + 1) * CHUNK)
+        _call(address, chunk * CHUNK, end, arguments)  # type: ignore[call-arg]
