@@ -210,10 +210,14 @@ def equal() -> Rows:
     for case, name in dict.fromkeys((row["case"], row["contestant"]) for row in rows):
         found = [row for row in rows if (row["case"], row["contestant"]) == (case, name)]
         nearest = min(found, key=lambda row: row["error_percent"])
-        for row in () if name == "ours" else [
-            *(x for x in found if x["recommended"] and x["refine"] == 1 and x is not nearest),
-            nearest,
-        ]:
+        for row in (
+            ()
+            if name == "ours"
+            else [
+                *(x for x in found if x["recommended"] and x["refine"] == 1 and x is not nearest),
+                nearest,
+            ]
+        ):
             same = [x for x in ours if x["case"] == case and x["law"] == row["law"]]
             near = [x["cpu_ms_a_frame"] for x in same if x["error_percent"] <= row["error_percent"]]
             quick = [
