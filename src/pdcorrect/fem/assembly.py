@@ -75,6 +75,4 @@ def sparse_times(matrix: sp.csr_matrix, x: Array) -> Array:
 
 def scatter(cells: NDArray[np.int64], values: Array, count: int) -> Array:
     """Sum cell-wise nodal values (C, K, 3) into (count, 3)."""
-    flat = cells.ravel()
-    columns = [np.bincount(flat, values[..., i].ravel(), minlength=count) for i in range(3)]
-    return np.stack(columns, axis=1)
+    return np.asarray(kernels.scatter(cells, values, count))

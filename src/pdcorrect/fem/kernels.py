@@ -333,3 +333,14 @@ def sparse_times(starts, columns, entries, x):  # type: ignore[no-untyped-def]
             for i in range(3):
                 out[row, i] += entries[k] * x[columns[k], i]
     return out
+
+
+@njit(**OPTIONS)
+def scatter(cells, values, count):  # type: ignore[no-untyped-def]
+    """Sums (count, 3) of values (C, K, 3) at the nodes of cells (C, K)."""
+    out = np.zeros((count, 3))
+    for c in range(len(cells)):
+        for k in range(cells.shape[1]):
+            for i in range(3):
+                out[cells[c, k], i] += values[c, k, i]
+    return out
