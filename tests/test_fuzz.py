@@ -144,7 +144,8 @@ CHOICES = {
     "element": ["hex8", "hex8-mean", "hex8-bubble", "hex8-bubble-mean", "hex27"],
     "mass": ["lumped", "averaged", "consistent", "per-node"],
     "energy": [
-        "corotated", "corotated-only", "volume-only", "neo-hookean", "st-venant-kirchhoff"
+        "corotated", "corotated-only", "volume-only", "neo-hookean", "st-venant-kirchhoff",
+        "linear-corotated",
     ],
     "integrator": ["backward-euler", "bdf2", "midpoint", "generalised-alpha", "quasi-static"],
 }  # fmt: skip

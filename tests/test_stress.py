@@ -20,6 +20,7 @@ ELEMENTS = [
 ]  # fmt: skip
 ENERGIES = [
     "corotated", "corotated-only", "arap", "volume-only", "neo-hookean", "st-venant-kirchhoff",
+    "linear-corotated",
 ]  # fmt: skip
 
 every_element = pytest.mark.parametrize("element", ELEMENTS)

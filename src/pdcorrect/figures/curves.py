@@ -187,9 +187,11 @@ def plot_error_over_time(
 
 
 def plot_error_against_time(
-    points: Mapping[str, tuple[float, float]], output: str | Path, relative: bool = False
+    points: Mapping[str, tuple[float | Array, float | Array]],
+    output: str | Path,
+    relative: bool = False,
 ) -> Path:
-    """RMS error (m) against seconds a frame, both axes logarithmic, one mark a label.
+    """RMS error (m) against seconds a frame, both axes logarithmic, one kind of mark a label.
 
     ``relative``: errors are shares of the motion and shown in per cent.
     """
