@@ -16,7 +16,7 @@ DIGITS = 5
 """Significant digits that are kept."""
 
 
-def add(name: str, results: Any, device: str | None = None, **more: Any) -> None:
+def add(name: str, results: Any, device: str | None = None, prefix: str = "", **more: Any) -> None:
     """Put a case's results into the machine's record in place of its earlier ones.
 
     Parameters
@@ -27,12 +27,12 @@ def add(name: str, results: Any, device: str | None = None, **more: Any) -> None
         Rows, or rows by name.
     device : str, optional
         The GPU that was measured, after which the record is called; else it is the processor.
+    prefix : str
+        Of the record's name.
     **more
         Written beside the results.
     """
-    machine = environment()
-    label = device or f"{machine['processor']} {machine['cores']}cores"
-    path = RESULTS / (re.sub(r"[^a-z0-9]+", "-", label.lower()).strip("-") + ".json")
+    machine, path = environment(), _path(device, prefix)
     record = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
     script = Path(sys.argv[0]).name
     record[name] = {
@@ -45,6 +45,19 @@ def add(name: str, results: Any, device: str | None = None, **more: Any) -> None
     RESULTS.mkdir(exist_ok=True)
     path.write_text(text(record), encoding="utf-8")
     print(f"wrote {path}")
+
+
+def read(name: str, prefix: str = "") -> dict[str, Any]:
+    """What this machine's record has of a case; empty if nothing."""
+    path = _path(None, prefix)
+    record = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+    return dict(record.get(name, {}))
+
+
+def _path(device: str | None, prefix: str) -> Path:
+    machine = environment()
+    label = device or f"{machine['processor']} {machine['cores']}cores"
+    return RESULTS / f"{prefix}{re.sub('[^a-z0-9]+', '-', label.lower()).strip('-')}.json"
 
 
 def text(record: Any, depth: int = 0) -> str:
