@@ -207,7 +207,7 @@ def equal() -> Rows:
     rows = [row for row in results_of(RIVALS, "rivals") if "failed" not in row]
     ours = [row for row in rows if row["contestant"] == "ours"]
     cells = []
-    for case, name in dict.fromkeys((row["case"], row["contestant"]) for row in rows):
+    for case, name in sorted({(row["case"], row["contestant"]) for row in rows}):
         found = [row for row in rows if (row["case"], row["contestant"]) == (case, name)]
         nearest = min(found, key=lambda row: row["error_percent"])
         for row in (

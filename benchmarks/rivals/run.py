@@ -26,7 +26,7 @@ from case import CASES, Case
 
 import pdcorrect as pc
 
-HERE = Path(__file__).parent
+HERE = Path(__file__).resolve().parent
 sys.path.append(str(HERE.parent))
 
 import machine_file  # noqa: E402
@@ -79,7 +79,8 @@ def measured(python: Path, name: str, case: str, setting: str, refine: int) -> d
         try:
             done = subprocess.run(
                 [*command, case, setting, str(refine), str(out)],
-                env={**os.environ, **ONE}, capture_output=True, text=True, timeout=LIMIT,
+                env={**os.environ, **ONE}, cwd=folder, capture_output=True, text=True,
+                timeout=LIMIT,
             )  # fmt: skip
         except subprocess.TimeoutExpired:
             return {**row, "failed": f"more than {LIMIT} s"}
@@ -112,7 +113,11 @@ def main() -> None:
     record = machine_file.read(NAME, PREFIX)
     rows, versions = record.get("results", []), record.get("versions", {})
     for name, case in itertools.product(chosen.only, chosen.cases):
-        python = Path(sys.executable) if name == "ours" else chosen.folder / name / "bin/python"
+        python = (
+            Path(sys.executable)
+            if name == "ours"
+            else chosen.folder.absolute() / name / "bin/python"
+        )
         if not python.exists():
             print(f"{name}: no {python}, left out")
             continue
