@@ -9,7 +9,7 @@ INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c c
 .PHONY: demo demo-learn test test-slow lint docs bench clean
 
 demo: $(VENV)/view.stamp $(VENV)/learn.stamp
-	$(BIN)/pdcorrect compare examples/unseen_cross.toml --model torsion-exact --converged --frames 20 -o demo
+	$(BIN)/pdcorrect compare examples/unseen_cross.toml --model torsion-exact --converged --frames 20 -o demo --overwrite
 
 demo-learn: $(VENV)/learn.stamp
 	rm -rf demo-learn
