@@ -10,7 +10,7 @@ INSTALL := $(BIN)/python -m pip install --quiet --no-compile --disable-pip-versi
 .PHONY: demo demo-learn test test-slow lint docs bench clean
 
 demo: $(VENV)/demo.stamp
-	$(BIN)/pdcorrect compare examples/unseen_cross.toml --model torsion-exact --converged --frames 20 -o demo
+	$(BIN)/pdcorrect compare examples/unseen_cross.toml --model torsion-exact --converged --frames 20 -o demo --overwrite
 
 demo-learn: $(VENV)/learn.stamp
 	rm -rf demo-learn
