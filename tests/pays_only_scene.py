@@ -16,7 +16,7 @@ COUNTED = {
     "volume": ("energies", "nearest_volume_lanes"),
     "shear": ("energies", "corotated_lanes"),
     "hyperelastic": ("energies", "hyperelastic_lanes"),
-    "modes": ("internal_modes", "relax"),
+    "modes": ("internal_modes", "_follow"),
 }
 END = {"plane": "x", "at": "max"}
 HELD = {"region": {"plane": "x", "at": "min"}}

@@ -69,7 +69,7 @@ def test_it_is_symmetric_and_positive_where_parts_turn_differently(rng):
 def test_rotations_of_a_rigidly_turned_body_are_that_rotation():
     problem = pc.discretise(beam((3, 2, 1), clamps=[], loads=[]))
     rotations, R = Rotations(problem), rotation(7)
-    before = rotations.of_cells(problem.positions)
+    before = problem.cell_rotations(problem.positions)
     found = rotations.since(before, problem.positions @ R.T)
     np.testing.assert_allclose(found, np.broadcast_to(R, found.shape), atol=1e-12)
 

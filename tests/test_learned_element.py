@@ -231,7 +231,7 @@ def test_newton_and_projective_dynamics_agree(integrator):
 @pytest.mark.parametrize("solver", [pc.ProjectiveDynamics, pc.Newton])
 def test_statics_end_in_equilibrium(solver):
     problem = learned_problem(beam(time={"integrator": "quasi-static", "frames": 2}))
-    result = pc.rollout(solver(problem, tolerance=1e-9), 2)
+    result = pc.rollout(solver(problem, tolerance=1e-10), 2)
     unbalanced = problem.forces(result.positions[-1]) + problem.external_forces(1.0)
     assert (
         np.abs(unbalanced[problem.free]).max() < 1e-6 * np.abs(problem.external_forces(1.0)).max()

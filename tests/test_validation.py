@@ -36,7 +36,6 @@ COVERED = {
     "stress": "test_robustness, test_recovery, test_thin_cells",
     "time_error": "test_integrators",
     "time_orders": "test_integrators, test_loads_in_time",
-    "unlike_bodies": "test_converged, test_error_estimate",
     "unlike_families": "test_converged, test_error_estimate",
 }
 """Quick parts whose behaviour smaller tests have, and which."""

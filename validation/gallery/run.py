@@ -12,7 +12,10 @@ import common
 import pdcorrect as pc
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
-FRAMES = {"lifting_gripper": 12, "crawler": 12, "twisted_bar": 10, "bracket": 15}
+FRAMES = {
+    "lifting_gripper": 12, "crawler": 12, "pressure_finger": 8, "dropped_jelly": 14,
+    "twisted_bar": 10, "bracket": 15,
+}  # fmt: skip
 """Few, for converged motions with contact take minutes."""
 MODELS = {"learned": pc.learned_coarse, "best coarse": pc.best_coarse}
 TABLE = "Scenes"

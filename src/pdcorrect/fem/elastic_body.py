@@ -168,12 +168,13 @@ class ElasticBody:
     def following(self, positions: Array) -> Array:
         """The configuration (N + B, 3) whose modes follow as at rest, turned with their cells.
 
-        Near equilibrium, for the price of a rotation of each cell: where solvers begin.
+        Near equilibrium, for the price of a rotation of each cell: where solvers begin.  Modes of
+        strongly strained cells, and those without stiffness at rest, are zero.
         """
         self._check(positions, len(self.positions))
-        if not self.space.internal:
-            return positions
         out = self.extended(positions)
+        if not self.space.internal or self._at_rest is None:
+            return out
         turns = self.cell_rotations(positions)
         self._at_rest.follow(np.ascontiguousarray(turns), self.positions, out)
         return out
@@ -195,9 +196,13 @@ class ElasticBody:
         return np.einsum("cq,clxq->clx", shares, lanes, optimize=True)
 
     @cached_property
-    def _at_rest(self) -> Condensed:
-        """The tangent at rest."""
-        return self.condensed(self.extended(self.positions))
+    def _at_rest(self) -> Condensed | None:
+        """The tangent at rest, if modes have stiffness there."""
+        blocks = self.linearise(self.extended(self.positions)).blocks()
+        try:
+            return Condensed(blocks, self.space.local, self.cells.shape[1])
+        except np.linalg.LinAlgError:
+            return None
 
     def energy(self, positions: Array, modes: Array | None = None) -> float:
         """Elastic energy, J, with internal modes in equilibrium.

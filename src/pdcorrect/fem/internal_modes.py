@@ -14,6 +14,8 @@ from pdcorrect.fem.kernels import deformation, nodal_forces, stiffness, total
 Array = NDArray[np.float64]
 
 _BACKTRACKS = 30
+_STRAINED = 0.5
+"""Of a cell's size: change of shape beyond which its modes do not follow as at rest."""
 _CHORD = 100.0
 """Times ``near``: length of a step after which the next one tries the same tangent first."""
 
@@ -202,12 +204,20 @@ def _follow(solved, turns, rest, nodes, modes, out):  # type: ignore[no-untyped-
     width = nodes.shape[1]
     moved, amplitude = np.empty(3 * width), np.empty(3)
     for c in range(len(nodes)):
-        R = turns[c]
+        R, first = turns[c], nodes[c, 0]
+        size, most = 0.0, 0.0
         for k in range(width):
-            x = out[nodes[c, k]]
             for j in range(3):
-                turned = R[0, j] * x[0] + R[1, j] * x[1] + R[2, j] * x[2]
-                moved[3 * k + j] = turned - rest[nodes[c, k], j]
+                turned = 0.0
+                for i in range(3):
+                    turned += R[i, j] * (out[nodes[c, k], i] - out[first, i])
+                length = rest[nodes[c, k], j] - rest[first, j]
+                moved[3 * k + j] = turned - length
+                size, most = max(size, abs(length)), max(most, abs(turned - length))
+        if most > _STRAINED * size:
+            for m in range(modes.shape[1]):
+                out[modes[c, m]] = 0.0
+            continue
         for m in range(modes.shape[1]):
             for i in range(3):
                 total = 0.0
