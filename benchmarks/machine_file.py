@@ -34,10 +34,11 @@ def add(name: str, results: Any, device: str | None = None, prefix: str = "", **
     """
     machine, path = environment(), _path(device, prefix)
     record = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
-    script = Path(sys.argv[0]).name
+    script = Path(sys.argv[0]).resolve().relative_to(RESULTS.parents[1]).as_posix()
+    asked = [Path(x).name if Path(x).is_absolute() else x for x in sys.argv[1:]]
     record[name] = {
         "date": time.strftime("%Y-%m-%d"),
-        "command": " ".join(["python", f"benchmarks/{script}", *sys.argv[1:]]),
+        "command": " ".join(["python", script, *asked]),
         "environment": machine | ({} if device is None else {"device": device}),
         **more,
         "results": results,

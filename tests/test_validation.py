@@ -1,5 +1,8 @@
+import math
+
 """The cases of validation/, as far as they are quick, and their records."""
 
+import math
 import sys
 from pathlib import Path
 
@@ -29,7 +32,7 @@ COVERED = {
     "columns": "test_initial, test_integrators",
     "damping": "test_viscosity, test_energy_balance, test_integrators",
     "energy": "test_energy_balance",
-    "error_time": "test_compare",
+    "error_time": "test_converged, test_error_estimate, and fronts below",
     "four_errors": "test_integrators, test_convergence_orders, test_metrics",
     "gallery": "test_examples, which runs its scenes by both solvers",
     "newton": "test_steppers, test_elements",
@@ -83,3 +86,20 @@ def test_recorded_errors_give_the_recorded_omega(motion):
 def test_every_case_has_a_question_and_inputs_that_exist(name):
     assert CASES[name].question
     assert all(CASES[name].inputs().values())
+
+
+def test_fronts_are_interpolated_by_logarithms_and_end():
+    run = CASES["error_time"].module
+    points = [run.Point(n, t, e) for n, t, e in (("a", 1, 16), ("b", 4, 1), ("far", 2, 20))]
+    assert [point.name for point in run.front(points)] == ["a", "b"]
+    assert run.time_at(4.0, points) == pytest.approx(2.0)
+    assert run.error_at(2.0, points) == pytest.approx(4.0)
+    assert run.time_at(100.0, points) == pytest.approx(1.0)  # the quickest is nearer
+    assert run.error_at(9.0, points) == pytest.approx(1.0)
+    assert math.isnan(run.time_at(0.5, points))  # none is so near
+    assert math.isnan(run.error_at(0.5, points))  # none is so quick
+
+
+def test_all_cases_are_imported_side_by_side():
+    assert all(case.module for case in CASES.values())
+    assert CASES["error_time"].module.SCENES is not CASES["obstacles"].module.SCENES

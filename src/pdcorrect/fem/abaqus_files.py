@@ -375,7 +375,8 @@ class _Joined:
                 self._add(each, each.instance or name.upper(), prefix + each.name)
         for name, faces in self._surfaces.items():
             own = elements + np.arange(sum(len(block.nodes) for block in faces))
-            self._groups["ELSET"].setdefault(name, []).append(own)
+            unlike = f"surface {name}" if name in self._groups["ELSET"] else name
+            self._groups["ELSET"].setdefault(unlike, []).append(own)
             self._blocks += faces
             elements += len(own)
         groups = {

@@ -156,8 +156,10 @@ def _by_vtk(path: Path, pieces: list[tuple[int, int]], reason: str) -> Content:
     with tempfile.TemporaryDirectory() as folder:
         target = Path(folder) / "grid.npz"
         command = [sys.executable, "-m", "pdcorrect.fem.vtk_files", str(path), str(target)]
-        if subprocess.run(command, capture_output=True).returncode != 0:
-            raise MeshError(f"{path}: cannot be read by VTK, nor by meshio ({reason}).")
+        done = subprocess.run(command, capture_output=True, text=True, errors="replace")
+        if done.returncode != 0:
+            *_, last = ["it ended", *done.stderr.split("\n")[-2:-1]]
+            raise MeshError(f"{path}: cannot be read by VTK ({last}), nor by meshio ({reason}).")
         with np.load(target) as file:
             grid = dict(file)
     wanted = tuple(map(sum, zip(*pieces, strict=True)))
