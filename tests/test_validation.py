@@ -1,5 +1,3 @@
-import math
-
 """The cases of validation/, as far as they are quick, and their records."""
 
 import math

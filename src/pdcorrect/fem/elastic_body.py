@@ -168,16 +168,16 @@ class ElasticBody:
     def following(self, positions: Array) -> Array:
         """The configuration (N + B, 3) whose modes follow as at rest, turned with their cells.
 
-        Near equilibrium, for the price of a rotation of each cell: where solvers begin.  Modes of
-        strongly strained cells, and those without stiffness at rest, are zero.
+        Near equilibrium, for the price of a rotation of each cell: where solvers begin.  Where a
+        cell is strongly strained, or modes have no stiffness at rest, by one step of `relaxed`.
         """
         self._check(positions, len(self.positions))
-        out = self.extended(positions)
         if not self.space.internal or self._at_rest is None:
-            return out
+            return self.relaxed(positions, steps=1)
+        out = self.extended(positions)
         turns = self.cell_rotations(positions)
-        self._at_rest.follow(np.ascontiguousarray(turns), self.positions, out)
-        return out
+        near = self._at_rest.follow(np.ascontiguousarray(turns), self.positions, out)
+        return out if near else self.relaxed(positions, steps=1)
 
     def cell_rotations(self, positions: Array) -> Array:
         """Nearest rotation of each cell's mean deformation gradient, (C, 3, 3).

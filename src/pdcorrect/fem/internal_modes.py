@@ -200,7 +200,10 @@ def _recover(inverse, solved, nodes, modes, r, out):  # type: ignore[no-untyped-
 
 @njit(**OPTIONS)
 def _follow(solved, turns, rest, nodes, modes, out):  # type: ignore[no-untyped-def]
-    """Modes of out (N + B, 3): R times -K_bb^-1 K_bu times R^T times its nodes less the rest's."""
+    """Modes of out (N + B, 3): R times -K_bb^-1 K_bu times R^T times its nodes less the rest's.
+
+    False where a cell is too strained for that.
+    """
     width = nodes.shape[1]
     moved, amplitude = np.empty(3 * width), np.empty(3)
     for c in range(len(nodes)):
@@ -215,9 +218,7 @@ def _follow(solved, turns, rest, nodes, modes, out):  # type: ignore[no-untyped-
                 moved[3 * k + j] = turned - length
                 size, most = max(size, abs(length)), max(most, abs(turned - length))
         if most > _STRAINED * size:
-            for m in range(modes.shape[1]):
-                out[modes[c, m]] = 0.0
-            continue
+            return False
         for m in range(modes.shape[1]):
             for i in range(3):
                 total = 0.0
@@ -227,6 +228,7 @@ def _follow(solved, turns, rest, nodes, modes, out):  # type: ignore[no-untyped-
             for i in range(3):
                 value = R[i, 0] * amplitude[0] + R[i, 1] * amplitude[1] + R[i, 2] * amplitude[2]
                 out[modes[c, m], i] = value
+    return True
 
 
 class Condensed:
@@ -282,12 +284,12 @@ class Condensed:
         """The configuration's change (N + B, 3) for a change of the nodes (N, 3)."""
         return self.recovered(nodal, np.zeros((len(nodal) + self.size, 3)))
 
-    def follow(self, turns: Array, rest: Array, out: Array) -> None:
+    def follow(self, turns: Array, rest: Array, out: Array) -> bool:
         """Set the modes of ``out`` (N + B, 3) by its nodes, in cells turned by ``turns`` (C, 3, 3).
 
-        ``rest`` (N, 3) are positions at which they are zero.
+        ``rest`` (N, 3) are positions at which they are zero.  False where a cell is too strained.
         """
-        _follow(self._solved, turns, rest, self._nodes, self._modes, out)
+        return bool(_follow(self._solved, turns, rest, self._nodes, self._modes, out))
 
     def response(self, r: Array) -> Array:
         """The modes' change (N + B, 3) with nodes held, by forces r (N + B, 3)."""
