@@ -102,6 +102,7 @@ def test_no_output_is_replaced_unless_told(program, tmp_path, monkeypatch):
         (("simulate", scene, "-o", beside, "--vtu", tmp_path), "b.pvd"),
         (("simulate", scene, "-o", beside, "--report", tmp_path), "index.html"),
         (("compare", scene, "-o", tmp_path, "--no-figures", "--frames", 1), "index.html"),
+        (("compare", scene, "-o", tmp_path, "--no-figures", "--frames", 1), "report.json"),
         (("render", run, "-o", tmp_path / "run.png", "--size", "200x200"), "run.png"),
         (("export", run, "-o", tmp_path, "--no-stress"), "run.pvd"),
         (("evaluate", "tiny", "data", "-o", tmp_path, "--no-figures"), "summary.json"),

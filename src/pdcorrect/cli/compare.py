@@ -55,7 +55,6 @@ def compare(
     from pdcorrect.evaluation import compare as evaluate
     from pdcorrect.evaluation import converged as reference
     from pdcorrect.evaluation import report
-    from pdcorrect.evaluation.page import PAGE
     from pdcorrect.scene import Scene
 
     if figures:
@@ -70,7 +69,7 @@ def compare(
         loaded, model or [], gate=gate, hex27=hex27, learned=learned, second_order=converged
     )
     make_folder(output / report.VTU if vtu else output)
-    check_new(output / PAGE, overwrite=overwrite)
+    check_new(*(output / name for name in report.FILES), overwrite=overwrite)
     common.tell_of_compiling()
     count = frames or loaded.time.frames
     finer = _finer(loaded, count) if estimate_error else None

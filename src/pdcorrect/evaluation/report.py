@@ -27,6 +27,9 @@ from pdcorrect.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 
+TABLE, RECORD = "report.csv", "report.json"
+FILES = (PAGE, TABLE, RECORD)
+"""That every report has."""
 VTU = "vtu"
 """Folder, inside a report's, of what `write_series` writes."""
 _NOT_UNIQUE = 100.0
@@ -128,8 +131,8 @@ def write_report(comparison: Comparison, folder: str | Path, draw: bool = True) 
     The page holds its figures, so it needs no other file.
     """
     folder = make_folder(folder)
-    write_text(folder / "report.csv", to_csv(comparison))
-    write_text(folder / "report.json", to_json(comparison))
+    write_text(folder / TABLE, to_csv(comparison))
+    write_text(folder / RECORD, to_json(comparison))
 
     def page(pictures: Mapping[str, str]) -> Path:
         rows, sentences = table(comparison), notes(comparison)

@@ -22,7 +22,8 @@ class CellLoop:
 
     With several threads one loop for all kernels calls it by its address, `CHUNK` cells at a time.
     numba compiles the body of a ``prange`` and all that it calls four times, so a kernel with its
-    own takes three times as long to compile.
+    own takes three times as long to compile.  Kernels must not raise: an exception would wait for
+    the interpreter, which waits for the threads.
     """
 
     def __init__(self, function: Callable[..., None]) -> None:
