@@ -541,7 +541,7 @@ def test_sigterm_while_a_report_is_written_leaves_no_half_of_a_file(
 
     monkeypatch.setattr(Path, "write_bytes", half)
     arguments = ("compare", scene_file, "-o", folder, "--frames", 1, "--no-figures")
-    status, _, err = program(*arguments)
+    status, _, err = program(*arguments, "--overwrite")
     assert status == TERMINATED
     assert "SIGTERM" in err
     assert [p.name for p in folder.iterdir()] == ["report.csv"]
