@@ -5,11 +5,12 @@ import shlex
 import shutil
 import subprocess
 import sys
+import zlib
 from pathlib import Path
 
 import pytest
 
-from pdcorrect import Scene
+import pdcorrect as pc
 
 ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -41,7 +42,7 @@ def test_snippets_and_commands_run(page, checkout, program):
         elif language == "toml":
             from pdcorrect.data.configuration import DatasetConfig
 
-            (Scene if "[body]" in text else DatasetConfig).from_toml(text)
+            (pc.Scene if "[body]" in text else DatasetConfig).from_toml(text)
         else:
             for line in text.splitlines():
                 _run(shlex.split(line, comments=True), program)
@@ -76,7 +77,18 @@ def test_links_lead_somewhere_and_files_that_are_named_exist(page):
         assert any((place / name).exists() for place in places), f"{page.name}: {name}"
 
 
-def test_the_documentation_builds_without_warnings(tmp_path):
+def public_names():
+    """Those of the package, and what pages and examples import from its modules."""
+    yield from (f"pdcorrect.{name}" for name in pc.__all__)
+    for path in (*PAGES, *(ROOT / "examples").rglob("*.py")):
+        lines = re.findall(r"^ *from (pdcorrect\.\S+) import (.+)$", path.read_text("utf-8"), re.M)
+        yield from (f"{module}.{name}" for module, names in lines for name in names.split(", "))
+
+
+def test_the_documentation_builds_without_warnings_and_has_all_public_names(tmp_path):
     command = [sys.executable, "-m", "sphinx", "-W", "-q", "-b", "html", ROOT / "docs", tmp_path]
     built = subprocess.run(command, capture_output=True, text=True)
     assert built.returncode == 0, built.stderr
+    inventory = zlib.decompress((tmp_path / "objects.inv").read_bytes().split(b"\n", 4)[4])
+    documented = {line.split()[0] for line in inventory.decode().splitlines()}
+    assert set(public_names()) <= documented, set(public_names()) - documented

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from motion import assert_same, remembering, trajectory
-from pdcorrect.errors import FileFormatError, InputError, OutputError
+from pdcorrect.errors import FileFormatError, FileVersionError, InputError, OutputError
 from pdcorrect.io.trajectory import TrajectoryWriter, load_trajectory, save_trajectory
 from pdcorrect.io.trajectory_reader import written_by
 from pdcorrect.state import State, Status, StepResult
@@ -483,3 +483,4 @@ def test_files_that_break_the_layout_are_refused(saved, tmp_path, change, words)
         load_trajectory(path)
     assert words in str(refused.value)
     assert "broken.h5" in str(refused.value)
+    assert isinstance(refused.value, FileVersionError) == (words == "version 2")

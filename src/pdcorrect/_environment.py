@@ -79,7 +79,9 @@ def code_digest(*folders: str) -> str:
 
 
 HOME = "PDCORRECT_HOME"
-"""Environment variable: the folder with ``models`` and ``validation``; the checkout by default."""
+"""Environment variable: the folder with ``models`` and ``validation``; the checkout by default.
+
+A wheel has neither, the source archive both."""
 
 
 def home_folder(name: str, instead: str = "") -> Path:
@@ -93,8 +95,9 @@ def home_folder(name: str, instead: str = "") -> Path:
     checkout = Path(__file__).resolve().parents[2]
     if not (checkout / "pyproject.toml").is_file():
         raise InputError(
-            f"{name} by name: expected the environment variable {HOME} to name the folder that "
-            f"has {name!r} in it{instead}."
+            f"{name}: an installed wheel has none: unpack the source archive "
+            f"pdcorrect-{__version__}.tar.gz and set the environment variable {HOME} to its "
+            f"folder{instead}."
         )
     return checkout / name
 

@@ -25,9 +25,9 @@ def validate(
 ) -> None:
     """Run the validation cases, judge them by figures written down before, and report.
 
-    Cases are in the folder `validation` of the checkout, or of PDCORRECT_HOME.  Results in OUTPUT
-    are kept if neither code, expectations nor inputs have changed.  Exit status 1 if a figure is
-    not as expected.
+    Cases are in the folder `validation` of the checkout, or of PDCORRECT_HOME, as of the unpacked
+    source archive.  Results in OUTPUT are kept if neither code, expectations nor inputs have
+    changed.  Exit status 1 if a figure is not as expected.
     """
     harness = _harness()
     found = harness.find_cases(cases or ())

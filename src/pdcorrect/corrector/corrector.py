@@ -43,9 +43,6 @@ class CorrectorConfig(Strict):
         wholly free nodes of a body, at the proposed positions, is taken out of theirs: then
         linear momentum stays exactly, angular momentum to first order in delta.  Nodes with a
         held component keep what they have.
-    norm, shared, placement
-        LayerNorm on the output of each network but the decoder; whether all rounds have the same
-        weights; what is corrected, the coarse solver's answer.  Model files name them.
     """
 
     node_features: tuple[str, ...]
@@ -53,12 +50,9 @@ class CorrectorConfig(Strict):
     layers: PositiveCount
     width: PositiveCount
     mlp_layers: Annotated[int, Field(strict=True, ge=2)]
-    norm: Literal["hidden"] = "hidden"
-    shared: Literal[False] = False
     output: Literal["world", "frame"] = "frame"
     clip: Positive | None = 10.0
     momentum_neutral: bool = False
-    placement: Literal["state"] = "state"
 
     @field_validator("node_features")
     @classmethod

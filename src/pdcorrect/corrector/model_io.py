@@ -41,7 +41,7 @@ from safetensors import SafetensorError  # noqa: E402
 from safetensors import torch as safetensors  # noqa: E402
 
 FORMAT = "pdcorrect-model"
-VERSION = 5
+VERSION = 1
 WEIGHTS, DESCRIPTION = "weights.safetensors", "model.json"
 
 _CHECKSUM = "checksum"
@@ -70,7 +70,7 @@ class ModelRecord(Strict):
 
 
 class Description(Strict):
-    """``model.json`` without its checksum; all versions of the format since 2 have these keys."""
+    """``model.json`` without its checksum."""
 
     format: Literal["pdcorrect-model"] = "pdcorrect-model"
     version: int = VERSION
@@ -161,7 +161,7 @@ def model_folder(path_or_name: str | Path) -> Path:
 
 def models_folder() -> Path:
     """Where models are looked up by name."""
-    return home_folder("models", ", or the path of a model")
+    return home_folder("models", ", or give the path of a model")
 
 
 def unlike_ends(folders: Sequence[Path]) -> list[str]:
@@ -315,7 +315,8 @@ def load_model(path_or_name: str | Path, device: str | torch.device = "cpu") -> 
     ----------
     path_or_name : str or path
         Folder, or, as a text without slashes, the name of one in ``models`` of the folder
-        that the environment variable ``PDCORRECT_HOME`` names, by default of the checkout.
+        that the environment variable ``PDCORRECT_HOME`` names, by default of the checkout;
+        a wheel has no models, the source archive has.
     device : str or torch.device
 
     Raises

@@ -157,7 +157,7 @@ def plan_faults(config: DatasetConfig, plan: MeshPlan, shard: Shard) -> Iterator
 def same_scene(found: str, wanted: Scene) -> bool:
     """Whether a scene in TOML is another one but for the last digits of its numbers.
 
-    Keys that it lacks, as those of earlier versions may, have their defaults.
+    Keys that it lacks have their defaults.
     """
     try:
         return _same(Scene.from_toml(found).model_dump(), wanted.model_dump())

@@ -124,8 +124,7 @@ def generate(
 def finished(config: DatasetConfig, folder: Path, plan: MeshPlan) -> str | None:
     """The hash of a mesh's file; None if there is none, or one that is to be made again.
 
-    That is one that is damaged, or lacks a run or the single steps of one, as files of earlier
-    versions of the code may.
+    That is one that is damaged, or lacks a run or the single steps of one.
     """
     path = plan.path(folder)
     if not path.exists():

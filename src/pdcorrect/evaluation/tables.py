@@ -19,8 +19,8 @@ from pdcorrect.data.schema import REFERENCE
 from pdcorrect.evaluation.evaluation import EvaluatedRun, Evaluation
 from pdcorrect.evaluation.measures import TrajectoryMeasures
 
-VERSION = 3
-"""Of ``summary.json``; in 1, "gate" says only whether there was one."""
+VERSION = 1
+"""Of ``summary.json``."""
 SUMMARY, TRAJECTORIES, ERRORS, TABLE = "summary.json", "trajectories.csv", "errors.csv", "table.md"
 """Files of an evaluation."""
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import h5py
 import numpy as np
 
-from pdcorrect.errors import FileFormatError, InputError
+from pdcorrect.errors import FileFormatError, FileVersionError, InputError
 from pdcorrect.state import Status
 from pdcorrect.trajectory import Trajectory
 
@@ -37,6 +37,8 @@ def load_trajectory(path: str | Path, salvage: bool = False) -> Trajectory:
     FileFormatError
         If the file cannot be read, is not a trajectory, or is damaged; says which, and how many
         frames could be salvaged.
+    FileVersionError
+        If it is of another version of the format.
     """
     with _opened(Path(path)) as (file, extent):
         return _read(file, extent, salvage)
@@ -77,7 +79,7 @@ def _opened(path: Path) -> Iterator[tuple[Any, _Extent]]:
         ):
             yield file, extent
     except FileFormatError as error:
-        raise FileFormatError(f"{path}: {error}.") from None
+        raise type(error)(f"{path}: {error}.") from None
     except Exception as error:  # HDF5 raises nearly every type on damaged bytes
         lost = f"truncated ({extent.lost()})" if extent.truncated else "damaged"
         reason = " ".join(str(error.args[0] if error.args else type(error).__name__).split())
@@ -277,7 +279,7 @@ def _check_format(file: Any) -> None:
         raise FileFormatError(f"an HDF5 file, but not a trajectory: its format is not {FORMAT!r}")
     version = file.attrs.get("format_version")
     if version != VERSION:
-        raise FileFormatError(
+        raise FileVersionError(
             f"format version {version}, expected {VERSION}: use the matching pdcorrect"
         )
 

@@ -35,7 +35,7 @@ from safetensors import torch as safetensors  # noqa: E402
 from torch.utils.tensorboard import SummaryWriter  # noqa: E402
 
 FORMAT = "pdcorrect-checkpoint"
-VERSION = 5
+VERSION = 1
 NAME = "history.csv"
 COLUMNS = (
     "iteration", "stage", "seconds", "loss", "rate", "steps", "skipped", "failed_scenes",
