@@ -1,5 +1,6 @@
 """Every command and snippet of README.md and docs/ runs; links lead somewhere; pages build."""
 
+import inspect
 import re
 import shlex
 import shutil
@@ -14,6 +15,7 @@ import pdcorrect as pc
 
 ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+OTHERS = "validation", "benchmarks", "models", "datasets", "examples", "tests"
 BLOCK = re.compile(r"^```(python|sh|toml)\n(.*?)^```", re.S | re.M)
 FEW = {"simulate": 2, "compare": 1}
 """Frames that a command is given which names none."""
@@ -64,7 +66,11 @@ def anchors(page):
         yield re.sub(r"[^\w\- ]", "", heading.lower()).strip().replace(" ", "-")
 
 
-@each_page
+@pytest.mark.parametrize(
+    "page",
+    [*PAGES, *(p for part in OTHERS for p in sorted((ROOT / part).rglob("*.md")))],
+    ids=lambda page: str(page.relative_to(ROOT)),
+)
 def test_links_lead_somewhere_and_files_that_are_named_exist(page):
     text = re.sub(r"```.*?```", "", page.read_text(encoding="utf-8"), flags=re.S)
     for path, anchor in re.findall(r"\]\((?!http)([^)#\s]*)(?:#([^)\s]+))?\)", text):
@@ -78,8 +84,14 @@ def test_links_lead_somewhere_and_files_that_are_named_exist(page):
 
 
 def public_names():
-    """Those of the package, and what pages and examples import from its modules."""
-    yield from (f"pdcorrect.{name}" for name in pc.__all__)
+    """Those of the package, what they return, and what pages and examples import elsewhere."""
+    for name in pc.__all__:
+        yield f"pdcorrect.{name}"
+        if inspect.isfunction(found := getattr(pc, name)):
+            kind = vars(sys.modules[found.__module__]).get(found.__annotations__["return"])
+            ours = inspect.isclass(kind) and kind.__module__.startswith("pdcorrect.")
+            if ours and kind.__name__ not in pc.__all__:
+                yield f"{kind.__module__}.{kind.__name__}"
     for path in (*PAGES, *(ROOT / "examples").rglob("*.py")):
         lines = re.findall(r"^ *from (pdcorrect\.\S+) import (.+)$", path.read_text("utf-8"), re.M)
         yield from (f"{module}.{name}" for module, names in lines for name in names.split(", "))

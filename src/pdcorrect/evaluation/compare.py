@@ -213,25 +213,38 @@ class Row:
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """Outcome of `compare`."""
+    """Outcome of `compare`.
+
+    Attributes
+    ----------
+    rows : tuple of Row
+        In the order coarse to fine, without cases that failed.
+    runs, on_coarse : dict of str to Trajectory
+        By the label of the case, on its own mesh and on the coarse nodes.
+    reference : str
+        Label of the case that errors are measured against.
+    solver_error : float or None
+        Largest node distance between PD and Newton on the coarse mesh, m: they minimise the same
+        energy, so this is solver error, unless the body buckles and they take different branches.
+        None without both, or if a frame needed a fallback.
+    models : mapping
+        Of correctors, by label: model, base, the data set that it was trained on, that one's time
+        integrator, and digest of its weights.
+    failures : mapping of str to str
+        Why cases did not come to their end, by label.
+    converged, finer : Trajectory or None
+        The converged motion, and what errors on the coarse mesh are estimated by, if asked for.
+    """
 
     scene: Scene
-    rows: tuple[Row, ...]  # in the order coarse to fine, without cases that failed
-    # each case on its own mesh, and on the coarse nodes
+    rows: tuple[Row, ...]
     runs: dict[str, Trajectory]
     on_coarse: dict[str, Trajectory]
-    reference: str  # label of the case that errors are measured against
-    # largest node distance between PD and Newton on the coarse mesh, m: they minimise the same
-    # energy, so this is solver error, unless the body buckles and they take different branches.
-    # None without both, or if a frame needed a fallback
+    reference: str
     solver_error: float | None
     cases: tuple[Case, ...]
-    # of correctors, by label: model, base, the data set that it was trained on, that one's time
-    # integrator, and digest of its weights
     models: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
-    # of cases that did not come to their end, by label: why
     failures: Mapping[str, str] = field(default_factory=dict)
-    # the converged motion, and what errors on the coarse mesh are estimated by, if asked for
     converged: Trajectory | None = None
     finer: Trajectory | None = None
 

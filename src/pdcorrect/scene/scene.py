@@ -124,7 +124,14 @@ class Solver(Strict):
 
 
 class Scene(TomlConfig):
-    """A body, its material, how it is held and loaded, and for how long.
+    """A body, its material, how it is held and loaded, and for how long, in SI units.
+
+    The page on scenes has all keys.
+
+    Raises
+    ------
+    SceneError
+        If a key is missing, unknown or wrong; names it.
 
     Examples
     --------
@@ -253,7 +260,10 @@ def best_coarse(scene: Scene) -> Scene:
 
 
 def learned_coarse(scene: Scene) -> Scene:
-    """The scene on its coarse mesh with the learned element, see `pdcorrect.fem.learned`."""
+    """The scene with element "hex8-learned", whose cells a network has written, and averaged mass.
+
+    Cells that the network does not know keep "hex8-enhanced", and `discretise` warns of them.
+    """
     check_scene(scene)
     return scene.with_changes(solver={"element": "hex8-learned", "mass": "averaged"})
 

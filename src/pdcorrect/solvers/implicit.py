@@ -89,6 +89,12 @@ class ImplicitStepper:
         Factorisation, see `factorise`.
     recover : bool
         Whether to use the fallbacks.
+
+    Raises
+    ------
+    InputError
+        If an argument is wrong, the scene wants what the method does not have, or quasi-static
+        bodies can move rigidly.
     """
 
     name = "implicit"

@@ -142,6 +142,13 @@ def rollout(
     Trajectory
         ``frames + 1`` frames, the first one the initial state.  A `PdcorrectWarning` says if
         frames have inverted cells, or energy came from nowhere.
+
+    Raises
+    ------
+    ConvergenceError
+        See ``on_failure``.
+    InputError
+        If an argument, or what ``forces`` returns, has a wrong shape or value.
     """
     states = [stepper.problem.initial_state() if state is None else state]
     log = StepLog()
