@@ -181,7 +181,7 @@ def unlike_ends(folders: Sequence[Path]) -> list[str]:
 
 
 BACKWARD_EULER = "backward-euler"
-"""What all data sets have, also those of models that do not record it."""
+"""Of the runs of models that do not record it."""
 
 JOINT = "+"
 """Between the names of data sets that a model was trained on, together or one after another."""
