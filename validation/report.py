@@ -100,19 +100,20 @@ def write(sections: Sequence[Section], folder: Path, page: bool = True) -> Path:
 
 
 def conditions(sections: Sequence[Section]) -> str:
-    """When and on what all this was made, and how much was judged."""
-    records = [section.record for section in sections]
-    dates = sorted({record.date for record in records})
-    period = " to ".join(dict.fromkeys((dates[0], dates[-1]))) if dates else "never"
-    keys = ("processor", "threads", "dtype")
-    machines = {", ".join(r.environment.get(k, "") for k in keys) for r in records}
+    """How much was judged."""
     words = [row[-1] for each in sections for row in harness.judged(each.case, each.record)]
     return (
         f"{len(words)} figures of {len(sections)} cases were judged by what was written down "
         f"before: {words.count('known failure')} are known to fail, {words.count('outside')} are "
-        f"outside. Measured {period} on {'; '.join(sorted(machines))} (processor, threads, "
-        "precision)."
+        "outside. Seeds are in the cases' scripts."
     )
+
+
+def measured(record: harness.Record) -> str:
+    """When, on what and for how long."""
+    told = [record.environment.get(key, "") for key in ("processor", "dtype")]
+    threads = f"{record.environment.get('threads', '')} threads".replace("1 threads", "1 thread")
+    return ", ".join([record.date, *told, threads, f"{record.seconds / 60:.0f} min"])
 
 
 def on_page(sections: Sequence[Section]) -> tuple[list[Section], list[Section]]:
@@ -130,10 +131,11 @@ def markdown(sections: Sequence[Section]) -> Iterator[str]:
         title = each.case.title
         yield from (f"## {number}. {title}", "", each.finding, "")
         yield from (f"![{title}]({each.figure})", "")
-    yield from ("## Judged", "", "|case|verdict|finding|", "|---|---|---|")
+    yield from ("## Judged", "", "|case|verdict|finding|measured|", "|---|---|---|---|")
     for each in (*told, *others):
         finding = "above" if each.figure else " ".join(each.finding.split())
-        yield f"|{each.case.title}|{harness.verdict(each.case, each.record)}|{finding}|"
+        verdict = harness.verdict(each.case, each.record)
+        yield f"|{each.case.title}|{verdict}|{finding}|{measured(each.record)}|"
     for each in others:
         if each.record.error:
             yield from ("", f"{each.case.title}:", "", "```text", each.record.error.rstrip(), "```")
@@ -162,7 +164,8 @@ def as_html(sections: Sequence[Section]) -> Iterator[str]:
         verdict = harness.verdict(case, record)
         yield f"<details{' open' * (not record.passed)}><summary>{html.escape(case.title)}: "
         yield f'<span class="{verdict.split(":")[0]}">{html.escape(verdict)}</span></summary>'
-        yield f"<p>{html.escape(case.question)}</p><p>{html.escape(each.finding)}</p>"
+        lines = (case.question, each.finding, f"{measured(record)}: {record.command}")
+        yield from (f"<p>{html.escape(line)}</p>" for line in lines)
         yield f"<pre>{html.escape(record.error)}</pre>" if record.error else ""
         for table in record.tables:
             yield f"<h3>{html.escape(table['name'])}</h3>"
