@@ -164,11 +164,11 @@ def elements(width: str, height: str, length: str, rounds: str = "5") -> dict[st
 def iteration(length: str, refine: str, rules: str, first_hessian: str) -> dict[str, Any]:
     """Milliseconds of one iteration of L-BFGS with a full history, without the error estimate."""
     from pdcorrect.solvers.first_hessian import TrueHessian
-    from pdcorrect.solvers.implicit import limited_threads
     from pdcorrect.solvers.integrators import backward_euler
     from pdcorrect.solvers.minimise import MinimiserOptions, minimise
     from pdcorrect.solvers.step import GlobalSolver, StepObjective
     from pdcorrect.solvers.tangent_solver import TangentFactory
+    from pdcorrect.solvers.threads import limited_threads
 
     problem = pc.discretise(beam(int(length), rules), refine=int(refine))
     state = problem.rest_state()

@@ -51,7 +51,7 @@ def test_steps_take_one_thread_on_a_busy_machine_and_give_the_others_back(
 
 STEPS_IN_TWO_THREADS = """
 from threading import Event, Thread
-from pdcorrect.solvers.implicit import limited_threads
+from pdcorrect.solvers.threads import limited_threads
 from threadpoolctl import threadpool_info
 
 def blas():

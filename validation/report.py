@@ -1,4 +1,4 @@
-"""The report of cases: short Markdown with figures, and an HTML page with every judged figure.
+"""The report of cases on one page: ten figures, a table of the others, and all judged figures.
 
 python validation/report.py
 
@@ -24,6 +24,11 @@ from pdcorrect._files import make_folder, write_bytes, write_text
 from pdcorrect.errors import OutputError
 
 HERE = Path(__file__).parent
+FIGURES = (
+    "error_time", "unlike_families", "easy_to_hard", "four_errors", "time_orders", "energy",
+    "stress", "cook", "locking", "turek_hron",
+)  # fmt: skip
+"""Cases that are told with a figure, in the order of the page."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +74,7 @@ def finding(case: harness.Case, record: harness.Record) -> str:
 
 def figure(case: harness.Case, record: harness.Record, folder: Path) -> str:
     """Draw a case's figure from its record; its path in the folder, "" if it has none."""
-    if not hasattr(case.module, "draw") or importlib.util.find_spec("matplotlib") is None:
+    if case.name not in FIGURES or importlib.util.find_spec("matplotlib") is None:
         return ""
     place = make_folder(folder / "figures") / f"{case.name}.png"
     with tempfile.TemporaryDirectory() as scratch:  # a figure is there whole or not at all
@@ -95,27 +100,46 @@ def write(sections: Sequence[Section], folder: Path, page: bool = True) -> Path:
 
 
 def conditions(sections: Sequence[Section]) -> str:
-    """When and on what all this was made."""
-    records = [section.record for section in sections]
-    dates = sorted({record.date for record in records})
-    period = " to ".join(dict.fromkeys((dates[0], dates[-1]))) if dates else "never"
-    keys = ("processor", "threads", "dtype")
-    machines = {", ".join(r.environment.get(k, "") for k in keys) for r in records}
+    """How much was judged."""
+    words = [row[-1] for each in sections for row in harness.judged(each.case, each.record)]
     return (
-        f"Measured {period} on {'; '.join(sorted(machines))} (processor, threads, precision). "
-        "Judged are figures whose expectation was written down before."
+        f"{len(words)} figures of {len(sections)} cases were judged by what was written down "
+        f"before: {words.count('known failure')} are known to fail, {words.count('outside')} are "
+        "outside. Seeds are in the cases' scripts."
     )
 
 
+def measured(record: harness.Record) -> str:
+    """When, on what and for how long."""
+    told = [record.environment.get(key, "") for key in ("processor", "dtype")]
+    threads = f"{record.environment.get('threads', '')} threads".replace("1 threads", "1 thread")
+    return ", ".join([record.date, *told, threads, f"{record.seconds / 60:.0f} min"])
+
+
+def on_page(sections: Sequence[Section]) -> tuple[list[Section], list[Section]]:
+    """Those that are told with a figure, in the page's order, and the others."""
+    told = [each for each in sections if each.figure]
+    told.sort(key=lambda each: FIGURES.index(each.case.name))
+    return told, [each for each in sections if not each.figure]
+
+
 def markdown(sections: Sequence[Section]) -> Iterator[str]:
-    """A paragraph a case: verdict, finding, figure."""
+    """A sentence and a figure for each case of `FIGURES`, and a row for each other."""
     yield from ("# Validation report", "", conditions(sections), "")
-    for each in sections:
-        case, record = each.case, each.record
-        yield from (f"## {case.title}", "")
-        yield f"**{harness.verdict(case, record).capitalize()}.** {each.finding}".rstrip()
-        yield from ("", "```text", record.error.rstrip(), "```") if record.error else ()
-        yield from ("", f"![{case.title}]({each.figure})", "") if each.figure else ("",)
+    told, others = on_page(sections)
+    for number, each in enumerate(told, start=1):
+        title = each.case.title
+        yield from (f"## {number}. {title}", "", each.finding, "")
+        yield from (f"![{title}]({each.figure})", "")
+    yield from ("## Judged", "", "|case|verdict|finding|measured|", "|---|---|---|---|")
+    for each in (*told, *others):
+        finding = "above" if each.figure else " ".join(each.finding.split())
+        verdict = harness.verdict(each.case, each.record)
+        yield f"|{each.case.title}|{verdict}|{finding}|{measured(each.record)}|"
+    for each in others:
+        if each.record.error:
+            yield from ("", f"{each.case.title}:", "", "```text", each.record.error.rstrip(), "```")
+    yield ""
 
 
 _STYLE = """body { font: 16px/1.5 system-ui, sans-serif; max-width: 70rem; margin: 2rem auto }
@@ -125,22 +149,27 @@ th, td { padding: 0.2rem 0.8rem 0.2rem 0; border-bottom: 1px solid #ddd; vertica
 
 
 def as_html(sections: Sequence[Section]) -> Iterator[str]:
-    """The same with all tables and all figures that were judged."""
+    """The same with all tables and all figures that were judged, folded up by case."""
     yield f'<!doctype html><html lang="en"><head><meta charset="utf-8"><style>{_STYLE}</style>'
     yield "<title>pdcorrect: validation report</title></head><body><h1>Validation report</h1>"
     yield f"<p>{html.escape(conditions(sections))}</p>"
-    for each in sections:
-        case, record, path = each.case, each.record, each.figure
+    told, others = on_page(sections)
+    for each in told:
+        title = html.escape(each.case.title)
+        yield f"<h2>{title}</h2><p>{html.escape(each.finding)}</p>"
+        yield f'<p><img src="{each.figure}" alt="{title}"></p>'
+    yield "<h2>Judged</h2>"
+    for each in (*told, *others):
+        case, record = each.case, each.record
         verdict = harness.verdict(case, record)
-        yield f"<h2>{html.escape(case.title)}</h2><p>{html.escape(case.question)}</p>"
-        yield f'<p class="{verdict.split(":")[0]}">{html.escape(verdict)}</p>'
-        yield f"<p>{html.escape(each.finding)}</p>"
+        yield f"<details{' open' * (not record.passed)}><summary>{html.escape(case.title)}: "
+        yield f'<span class="{verdict.split(":")[0]}">{html.escape(verdict)}</span></summary>'
+        lines = (case.question, each.finding, f"{measured(record)}: {record.command}")
+        yield from (f"<p>{html.escape(line)}</p>" for line in lines)
         yield f"<pre>{html.escape(record.error)}</pre>" if record.error else ""
-        yield f'<p><img src="{path}" alt="{html.escape(case.title)}"></p>' if path else ""
         for table in record.tables:
             yield f"<h3>{html.escape(table['name'])}</h3>"
             yield from _table(table["headings"], table["rows"])
-        yield f"<details{' open' if record.outside else ''}><summary>Judged figures</summary>"
         yield from _table(harness.JUDGED, harness.judged(case, record))
         yield "</details>"
     yield "</body></html>"

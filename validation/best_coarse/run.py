@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import common
@@ -273,24 +272,6 @@ SHOWN = {
     "hex8, 2×2×2 cells a cell": Model("hex8", refine=2),
 }
 """Models of the picture, by name; with the averaged mass but the first and last."""
-
-
-def draw(record: common.Record, path: Path) -> None:
-    """RMS error of each model over the plain mesh's, in each motion."""
-    figure, axis = common.panels(9, 5.6)
-    rows = np.arange(len(MOTIONS))
-    for k, (name, model) in enumerate(SHOWN.items()):
-        omegas = np.array([record.figures[f"{motion}, {model.label}"] for motion in MOTIONS], float)
-        left = np.sqrt(1.0 - omegas / 100.0)
-        place = rows + 0.1 * (k - 3.0)
-        axis.plot(left, place, common.MARKS[k], color=common.COLOURS[k], label=name)
-    axis.axvline(1.0, color="0.4", linewidth=0.8)
-    axis.set(xscale="log", xlabel="RMS error over the plain mesh's")
-    common.log_axis(axis.xaxis)
-    axis.set_yticks(rows, list(MOTIONS))
-    axis.invert_yaxis()
-    common.plain(axis, "x")
-    common.save(figure, path, axis, 3)
 
 
 def finding(record: common.Record) -> str:

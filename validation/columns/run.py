@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import common
@@ -163,18 +162,3 @@ def finding(record: common.Record) -> str:
         f"{f['cube, generalised-alpha, angular momentum']:.0e} by generalised-α and "
         f"{f['cube, backward-euler, angular momentum']:.0e} by backward Euler."
     )
-
-
-def draw(record: common.Record, path: Path) -> None:
-    """The top of both columns over time."""
-    figure, panels = common.panels(12, 3.8, 2)
-    rows = record.table("Top of the columns")["rows"]
-    units = {"bending": "displacement of the top, m", "twisting": "twist of the top, degrees"}
-    for axis, motion in zip(panels, STEPS, strict=True):
-        for k, model in enumerate(MODELS):
-            points = [row[2:] for row in rows if row[:2] == [motion, model]]
-            style = {"color": common.COLOURS[k], "linewidth": 1.2}
-            axis.plot(*np.transpose(points), label=model, **style)
-        axis.set(title=motion, xlabel="s", ylabel=units[motion])
-        common.plain(axis)
-    common.save(figure, path, panels[0], 5)

@@ -86,25 +86,6 @@ def parts(quick: bool) -> dict[str, Callable[[], common.Outcome]]:
     return {split: partial(outcome, split) for split in SPLITS[: 1 if quick else None]}
 
 
-def draw(record: common.Record, path: Path) -> None:
-    """Largest errors without a gate and with the default one, and what that refuses."""
-    (table,) = record.tables
-    found = {(row[0], row[1]): row for row in table["rows"]}
-    figure, axis = common.panels(8, 3.4)
-    for k, gate in enumerate(("none", "default")):
-        errors = [found[split, gate][3] for split in SPLITS]
-        label = {"none": "no gate", "default": "default gate"}[gate]
-        axis.bar(
-            np.arange(len(SPLITS)) + 0.4 * k, errors, 0.38, color=common.COLOURS[k], label=label
-        )
-    refused = [f"{split}\n{found[split, 'default'][5]:.0f} % refused" for split in SPLITS]
-    axis.set_xticks(np.arange(len(SPLITS)) + 0.2, refused, fontsize=8)
-    axis.axhline(1.0, color="black", linewidth=0.8)
-    axis.set_ylabel("largest RMS error over\nthe coarse model's")
-    common.plain(axis, "y")
-    common.save(figure, path, axis)
-
-
 def finding(record: common.Record) -> str:
     """How many of the splits are harmed."""
     harmed = [split for split in SPLITS if record.figures[f"{split}, harmed, per cent"] > 1.0]

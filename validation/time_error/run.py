@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import common
@@ -112,27 +111,3 @@ def finding(record: common.Record) -> str:
         "Mean errors by backward Euler, generalised-α and generalised-α at half the step: "
         f"{'; '.join(told)}."
     )
-
-
-def draw(record: common.Record, path: Path) -> None:
-    """Errors of each scene by integrator, a panel a motion and damping."""
-    cases = [(kind, damping) for kind in KINDS for damping in KINDS[kind]]
-    figure, panels = common.panels(14, 3.8, len(cases), sharey=True)
-    table = record.tables[0]
-    for axis, (kind, damping) in zip(panels, cases, strict=True):
-        rows = [row[4:] for row in table["rows"] if row[:2] == [kind, damping]]
-        for k in range(len(RUNS)):
-            found = [row[k] for row in rows]
-            axis.plot([k] * len(found), found, "o", color=common.COLOURS[0], alpha=0.5)
-            axis.plot([k - 0.3, k + 0.3], 2 * [np.mean(found)], color=common.COLOURS[1])
-        axis.set_xticks(range(len(RUNS)), [shortened(name) for name in RUNS], rotation=90)
-        axis.set(title=kind + (f", {damping}" if damping != "none" else ""), yscale="log")
-        common.log_axis(axis.yaxis)
-        common.plain(axis, "y")
-    panels[0].set_ylabel("error, % of the RMS displacement")
-    common.save(figure, path)
-
-
-def shortened(name: str) -> str:
-    """For a tick."""
-    return name.replace("generalised-alpha", "gen.-α")

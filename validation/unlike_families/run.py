@@ -141,24 +141,21 @@ def case(quick: bool) -> common.Outcome:
 
 
 def finding(record: common.Record) -> str:
-    """Means, medians and how often the learned element is nearer."""
+    """Mean and median errors with two substeps, and how often the learned element is nearer."""
     figures = record.figures
 
     def pair(which: str) -> str:
-        return f"{figures[f'mean, {which}, %']:.1f} ({figures[f'median, {which}, %']:.1f})"
+        mean, median = (figures[f"{kind}, {which}, 2, %"] for kind in ("mean", "median"))
+        return f"{which} {mean:.1f} ({median:.1f})"
 
-    def of(name: str) -> str:
-        return ", ".join(f"{figures[name.format(n)]:.0f}" for n in SUBSTEPS)
-
-    errors = "; ".join(
-        f"{which} {', '.join(pair(f'{which}, {n}') for n in SUBSTEPS)}"
-        for which in ("best coarse", "learned", "hex27")
+    nearer = (
+        f"{figures[f'learned nearer than {which}, 2 substeps, % of scenes']:.0f} % of scenes"
+        for which in ("best coarse", "hex27")
     )
     return (
-        f"Mean (median) errors, %, with one, two and four substeps: {errors}; learned on 2×2×2 "
-        f"cells {pair('learned on 2x2x2, 2')}. With as many substeps learned is nearer than best "
-        f"coarse in {of('learned nearer than best coarse, {} substeps, % of scenes')} of 100 "
-        f"scenes, than hex27 in {of('learned nearer than hex27, {} substeps, % of scenes')}."
+        f"Mean (median) errors with two substeps, %: "
+        f"{', '.join(pair(which) for which in ('best coarse', 'learned', 'hex27'))}. Learned is "
+        f"nearer than best coarse in {', than hex27 in '.join(nearer)}."
     )
 
 

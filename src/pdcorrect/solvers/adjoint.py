@@ -26,9 +26,10 @@ from pdcorrect.errors import ConvergenceError, InputError
 from pdcorrect.fem.internal_modes import Condensed
 from pdcorrect.solvers.adjoint_solve import AdjointSolver
 from pdcorrect.solvers.gradients import Gradients, TakenStep
-from pdcorrect.solvers.implicit import ImplicitStepper, limited_threads, positive
+from pdcorrect.solvers.implicit import ImplicitStepper, positive
 from pdcorrect.solvers.integrators import Integrator, equal_steps, solution
 from pdcorrect.solvers.step import StepObjective, nodal_array
+from pdcorrect.solvers.threads import limited_threads
 from pdcorrect.state import State, Status, StepResult
 
 Array = NDArray[np.float64]
