@@ -8,7 +8,7 @@ writes what `TABLES[NAME]` gives between the two lines, in every Markdown file o
 
 A table is a function without arguments that returns the header's cells and the rows' cells; those
 of models are in `model_tables`, those of pages in `page_tables`, those of cases about time in
-`time_tables`, and what all use in `records`.
+`time_tables` and `break_even_tables`, and what all use in `records`.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from functools import partial
 from pathlib import Path
 
 import benchmark_tables
+import break_even_tables
 import model_tables
 import page_tables
 import time_tables
@@ -69,11 +70,11 @@ def _millimetres(metres: float | None, reference: bool) -> str:
 
 TABLES: dict[str, Callable[[], Rows]] = {
     "demo": partial(comparison, "unseen_cross"),
-    "twisted-cross": partial(comparison, "twisted_cross"),
     **dict(model_tables.tables()),
     **dict(benchmark_tables.tables()),
     **dict(page_tables.tables()),
     **dict(time_tables.tables()),
+    **dict(break_even_tables.tables()),
 }
 
 
