@@ -155,6 +155,51 @@ def results() -> Rows:
     return head, rows
 
 
+def right_masses() -> Rows:
+    """The thesis's scenes with right masses: mean and worst Omega, mean distances."""
+    record = read(RECORDS / "thesis_scenes.json")
+    figures, count = record["figures"], _scenes(record, "Omega, %")[1]
+    runs = ("learned", "hex27", "best coarse", "intermediate")
+    rows = []
+    for motion, thesis in THESIS.items():
+        omegas = [
+            [percent(figures[f"{motion}, {run}, Omega, %, {kind}"]) for kind in ("mean", "worst")]
+            for run in runs
+        ]
+        distances = (figures[f"{motion}, {r}, RMS from the fine run, mm, mean"]
+                     for r in runs[:3])  # fmt: skip
+        corrected = record_of(f"{motion}-as-published")["runs"]["corrected"]["omega"]["mean"]
+        rows.append([
+            f"{motion}, {count[motion]}", f"{thesis}, {percent(corrected)}",
+            *(f"{mean} ({worst})" for mean, worst in omegas), ", ".join(map(number, distances)),
+        ])  # fmt: skip
+    head = ("motion, scenes", "thesis, corrector, as published", *runs,
+            "RMS, mm: learned, hex27, best coarse")  # fmt: skip
+    return head, rows
+
+
+def right_masses_converged() -> Rows:
+    """The same scenes: mean distances from the converged motion."""
+    record, name = read(RECORDS / "thesis_scenes.json"), "Errors, % of the RMS displacement"
+    heads, count = _scenes(record, name)
+    figures = record["figures"]
+    rows = [
+        [
+            f"{motion}, {count[motion]}",
+            *(number(figures[f"{motion}, {run}, {name}, mean"], 2) for run in heads[1:]),
+        ]
+        for motion in THESIS
+    ]
+    return ("motion, scenes", *heads[1:]), rows
+
+
+def _scenes(record: Mapping[str, Any], name: str) -> tuple[list[str], dict[str, int]]:
+    """Headings of a table of `validation/thesis_scenes`, and its scenes by motion."""
+    table = next(table for table in record["tables"] if table["name"] == name)
+    scenes = [str(row[0]) for row in table["rows"]]
+    return table["headings"], {m: sum(s.startswith(m) for s in scenes) for m in THESIS}
+
+
 def losses() -> Rows:
     """Where the six models are behind their base or the intermediate mesh."""
     rows = []
@@ -254,6 +299,7 @@ def tables() -> Iterable[tuple[str, Any]]:
     """Names of the tables here and what makes them."""
     yield from {
         "models": released, "recipes": recipes, "results": results, "losses": losses,
+        "right-masses": right_masses, "right-masses-converged": right_masses_converged,
         "time-error": time_error,
         "further-splits": further_splits, "baselines": baselines,
         "element-studies": element_studies,

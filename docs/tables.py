@@ -8,7 +8,7 @@ writes what `TABLES[NAME]` gives between the two lines, in every Markdown file o
 
 A table is a function without arguments that returns the header's cells and the rows' cells; those
 of models are in `model_tables`, those of pages in `page_tables`, those of cases about time in
-`time_tables`, and what all use in `records`.
+`time_tables` and `break_even_tables`, and what all use in `records`.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ import argparse
 import re
 import sys
 from collections.abc import Callable, Iterable, Sequence
-from functools import partial
 from pathlib import Path
 
 import benchmark_tables
+import break_even_tables
 import model_tables
 import page_tables
 import time_tables
-from records import RECORDS, ROOT, Rows, number, read
+from records import ROOT, Rows
 
 _BLOCK = re.compile(r"(<!-- table: ([a-z0-9-]+) -->\n).*?(<!-- end -->)", re.DOTALL)
 _SKIPPED = {".git", ".venv", "node_modules", "_build"}
@@ -33,35 +33,12 @@ _SKIPPED = {".git", ".venv", "node_modules", "_build"}
 # --- the tables ------------------------------------------------------------------------------
 
 
-def comparison(name: str) -> Rows:
-    """A run of ``pdcorrect compare --converged`` with the model torsion-exact.
-
-    First the error to the converged motion, then the time.
-    """
-    record = read(RECORDS / f"{name}.json")
-    return ("solver", "error, %", "ms a frame", "RMS, mm", "nodes"), [
-        [
-            row["label"],
-            number(100 * row["relative_error"]),
-            number(row["seconds_a_frame"] * 1e3),
-            _millimetres(row["rms_error"], row["label"] == record["reference"]),
-            str(row["nodes"]),
-        ]
-        for row in record["rows"]
-        if row["label"] != "coarse Newton"
-    ]
-
-
-def _millimetres(metres: float | None, reference: bool) -> str:
-    return "reference" if reference or metres is None else number(metres * 1e3)
-
-
 TABLES: dict[str, Callable[[], Rows]] = {
-    "twisted-cross": partial(comparison, "twisted_cross"),
     **dict(model_tables.tables()),
     **dict(benchmark_tables.tables()),
     **dict(page_tables.tables()),
     **dict(time_tables.tables()),
+    **dict(break_even_tables.tables()),
 }
 
 

@@ -98,6 +98,50 @@ def test_fronts_are_interpolated_by_logarithms_and_end():
     assert math.isnan(run.error_at(0.5, points))  # none is so quick
 
 
+def break_even():
+    assert CASES["error_time"].module  # its folder is on the path now
+    import break_even
+
+    return break_even
+
+
+def test_a_cost_is_repaid_once_the_sums_are_equal_and_never_without_a_saving():
+    simulations = break_even().simulations
+    assert simulations(10.0, own=1.0, rival=3.0) == 5  # 10 + 5 x 1 = 5 x 3
+    assert simulations(10.0, own=1.0, rival=4.0) == 4  # not after three: 13 > 12
+    assert simulations(0.0, own=1.0, rival=3.0) == 0
+    assert math.isinf(simulations(10.0, own=3.0, rival=3.0))
+    assert math.isinf(simulations(0.0, own=4.0, rival=3.0))
+
+
+def test_the_rival_is_the_quickest_that_is_no_farther():
+    module = break_even()
+    rivals = [
+        module.Simulation(n, t, e) for n, t, e in (("far", 1, 5), ("slow", 9, 1), ("same", 2, 3))
+    ]
+    assert module.as_near(3.0, rivals).name == "same"  # a tie is as near
+    assert module.as_near(2.9, rivals).name == "slow"
+    assert module.as_near(0.5, rivals) is None
+
+
+def test_a_simulation_is_its_set_up_and_its_frames():
+    module, point = break_even(), CASES["error_time"].module.Point
+    reached = {
+        "a": [point("learned, 2", 20.0, 2.0), point("hex27, 2", 50.0, 2.0),
+              point("best on 4x4x4, 1", 1000.0, 1.0)]
+    }  # fmt: skip
+    set_up = {"learned": 0.5, "hex27": 0.1, "best on 4x4x4": 3.0}
+    (found,) = module.repaid(
+        "learned, 2", 8.0, reached, {"frames": {"a": 40}, "set_up": {"a": set_up}}
+    )
+    assert (found.rival, found.equal) == ("hex27, 2", 10)  # 8 s / (2.1 s - 1.3 s)
+    assert found.fixed == (10, 1)
+    assert found.near == (True, False)
+    del reached["a"][1:]
+    with pytest.raises(KeyError):
+        module.repaid("learned, 2", 8.0, reached, {"frames": {"a": 40}, "set_up": {"a": set_up}})
+
+
 def test_all_cases_are_imported_side_by_side():
     assert all(case.module for case in CASES.values())
     assert CASES["error_time"].module.SCENES is not CASES["obstacles"].module.SCENES

@@ -10,6 +10,8 @@ import numpy as np
 
 import pdcorrect as pc
 
+ERRORS, TIMES = "Errors, % of the RMS displacement", "Time a frame, ms"
+"""Tables of the case's record."""
 EULER, ALPHA = "backward-euler", "generalised-alpha"
 CORRECTORS = ("impulse-exact", "torsion-exact", "stretch-exact")
 FAMILIES = ("backward Euler", "coarse cells", "hex27", "finer cells", "learned", "corrector")
@@ -110,6 +112,19 @@ class Point:
     name: str
     time: float
     error: float
+
+
+def points_of(record: Any) -> dict[str, list[Point]]:
+    """What all methods that did not fail reached, by scene."""
+    times = {row[0]: row[1:] for row in record.table(TIMES)["rows"]}
+    return {
+        row[0]: [
+            Point(name, spent, error)
+            for name, spent, error in zip(METHODS, times[row[0]], row[3:], strict=True)
+            if spent is not None
+        ]
+        for row in record.table(ERRORS)["rows"]
+    }
 
 
 def front(points: Sequence[Point]) -> list[Point]:

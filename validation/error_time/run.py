@@ -12,15 +12,24 @@ from pathlib import Path
 import common
 import numpy as np
 from bodies import SCENES, scenes
-from methods import FAMILIES, METHODS, RIVALS, Point, error_at, front, time_at
+from methods import (
+    ERRORS,
+    FAMILIES,
+    METHODS,
+    RIVALS,
+    TIMES,
+    Point,
+    error_at,
+    front,
+    points_of,
+    time_at,
+)  # fmt: skip
 
 import pdcorrect as pc
 from pdcorrect.errors import ConvergenceError, PdcorrectWarning
 
 QUICK, FEW = "cantilever", {"frames": 8}
 """Scene and frames of a quick run, which has the methods of `ESTIMATED` only."""
-ERRORS = "Errors, % of the RMS displacement"
-TIMES = "Time a frame, ms"
 SHARES = "Estimated over true error"
 BESIDE = "Beside the front of what needs no training"
 ESTIMATED = ("best coarse, 1", "learned, 1", "hex27, 1")
@@ -83,19 +92,6 @@ def parts(quick: bool) -> dict[str, Callable[[], common.Outcome]]:
         scene = SCENES[QUICK].with_changes(time=FEW)
         return {QUICK: partial(of_scene, QUICK, scene, ESTIMATED)}
     return {name: partial(of_scene, name, scene) for name, scene in scenes().items()}
-
-
-def points_of(record: common.Record) -> dict[str, list[Point]]:
-    """What all methods that did not fail reached, by scene."""
-    times = {row[0]: row[1:] for row in record.table(TIMES)["rows"]}
-    return {
-        row[0]: [
-            Point(name, spent, error)
-            for name, spent, error in zip(METHODS, times[row[0]], row[3:], strict=True)
-            if spent is not None
-        ]
-        for row in record.table(ERRORS)["rows"]
-    }
 
 
 def summary(record: common.Record) -> common.Outcome:

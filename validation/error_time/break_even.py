@@ -1,0 +1,189 @@
+"""How many simulations repay the data and the training of a model, beside classical methods.
+
+python validation/error_time/break_even.py
+
+measures, on this machine, what no other record has, and writes
+``validation/results/break_even.json``: the time of some of the learned element's bodies and of some
+iterations of its training, and the set-up of each method in each scene, as seconds of CPU on one
+thread.  `repaid` computes the rest from that and from the record of errors and times.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import sys
+import time
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from methods import METHODS, RIVALS, Point
+
+HERE = Path(__file__).resolve().parent
+RECORD = HERE.parent / "results" / "break_even.json"
+EACH = 6
+"""Bodies of each of the ten kinds of file."""
+EPOCHS = 2
+NEVER = math.inf
+
+
+class Simulation(NamedTuple):
+    """Seconds, set-up included, and error of a method in a scene."""
+
+    name: str
+    seconds: float
+    error: float
+
+
+class Repaid(NamedTuple):
+    """Simulations that repay a cost in a scene, `NEVER`, or None where no rival is as near.
+
+    ``fixed`` are beside the rivals `fixed`, by time alone, and ``near`` whether the error is no
+    larger than theirs.
+    """
+
+    scene: str
+    rival: str
+    equal: float | None
+    fixed: tuple[float, ...]
+    near: tuple[bool, ...]
+
+
+def simulations(cost: float, own: float, rival: float) -> float:
+    """Simulations after which ``cost`` s and ``own`` s each are no more than ``rival`` s each."""
+    return math.ceil(cost / (rival - own)) if rival > own else NEVER
+
+
+def as_near(error: float, rivals: Sequence[Simulation]) -> Simulation | None:
+    """The quickest rival whose error is no larger; None if there is none."""
+    near = [rival for rival in rivals if rival.error <= error]
+    return min(near, key=lambda rival: rival.seconds) if near else None
+
+
+def stem(name: str) -> str:
+    """A method without its number of steps and its tolerance, on which no set-up depends."""
+    return name if name.endswith("Newton") else name.partition(",")[0]
+
+
+def fixed(name: str) -> tuple[str, str]:
+    """Rivals whatever their error: hex27 with as many steps a frame, and the fine mesh with one."""
+    quadratic = f"hex27, {name.rpartition(', ')[2]}"
+    return quadratic if quadratic in METHODS else "hex27, 1", "best on 4x4x4, 1"
+
+
+def whole(points: Sequence[Point], frames: int, set_up: dict[str, float]) -> list[Simulation]:
+    """Simulations of so many frames; set-ups, s, by `stem`."""
+    return [
+        Simulation(p.name, set_up[stem(p.name)] + 1e-3 * frames * p.time, p.error) for p in points
+    ]
+
+
+def repaid(
+    name: str, cost: float, points: dict[str, list[Point]], measured: dict[str, Any]
+) -> list[Repaid]:
+    """Of a method whose data and training take ``cost`` s, in each scene."""
+    out = []
+    for scene, reached in points.items():
+        every = whole(reached, measured["frames"][scene], measured["set_up"][scene])
+        of = {simulation.name: simulation for simulation in every}
+        own = of[name]
+        rival = as_near(own.error, [s for s in every if s.name in RIVALS])
+        equal = None if rival is None else simulations(cost, own.seconds, rival.seconds)
+        others = [of[other] for other in fixed(name)]
+        by_time = tuple(simulations(cost, own.seconds, other.seconds) for other in others)
+        near = tuple(own.error <= other.error for other in others)
+        out.append(Repaid(scene, "" if rival is None else rival.name, equal, by_time, near))
+    return out
+
+
+# --- what is measured ----------------------------------------------------------------------
+
+
+def set_ups() -> tuple[dict[str, dict[str, float]], dict[str, int]]:
+    """Seconds of the set-ups by scene and `stem`, and frames by scene."""
+    from bodies import scenes
+
+    from pdcorrect.errors import PdcorrectWarning
+
+    first = {stem(name): method for name, method in reversed(METHODS.items())}
+    found: dict[str, dict[str, float]] = {}
+    drawn = scenes()
+    for method in first.values():  # kernels are compiled and loaded
+        method.stepper(drawn["cantilever"]).prepare()
+    for label, scene in drawn.items():
+        found[label] = {}
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", PdcorrectWarning)
+            for name, method in first.items():
+                started = time.process_time()
+                method.stepper(scene).prepare()
+                found[label][name] = round(time.process_time() - started, 4)
+        print(label, found[label], flush=True)
+    return found, {label: scene.time.frames for label, scene in drawn.items()}
+
+
+def element_times() -> dict[str, Any]:
+    """Seconds a body and an iteration, from samples of both."""
+    from pdcorrect.elements.answers import answers
+    from pdcorrect.elements.bodies import draw
+    from pdcorrect.elements.collection import _CUT, _FREE, _TURN, A_FILE
+    from pdcorrect.elements.linear import sample
+    from pdcorrect.elements.training import _VALIDATION, ElementRecipe, Trainer
+
+    recipe = ElementRecipe()
+    samples, spent = [], []
+    for number in range(_TURN):
+        for i in range(EACH):
+            rng = np.random.default_rng([recipe.seed, number * A_FILE + i])
+            started = time.process_time()
+            found = answers(draw(rng, cut=number == _CUT, free=number == _FREE), rng)
+            spent.append(time.process_time() - started)
+            samples.append(sample(found))
+        print(f"file {number}: {np.mean(spent):.2f} s a body", flush=True)
+    trainer = Trainer(recipe, samples, samples[: recipe.batch], "cpu")
+    trainer.epoch()
+    before, started = trainer.iteration, time.process_time()
+    for _ in range(EPOCHS):
+        trainer.epoch()
+    seconds = time.process_time() - started
+    count = trainer.iteration - before
+    return {
+        "bodies": recipe.bodies + round(_VALIDATION * recipe.bodies),
+        "sampled_bodies": len(spent),
+        "seconds_a_body": float(np.mean(spent)),
+        "standard_error": float(np.std(spent, ddof=1) / math.sqrt(len(spent))),
+        "iterations": recipe.iterations,
+        "sampled_iterations": count,
+        "seconds_an_iteration": seconds / count,
+    }
+
+
+def main() -> None:
+    """Measure and write the record."""
+    import torch
+
+    from pdcorrect._environment import environment
+    from pdcorrect._files import write_text
+
+    torch.set_num_threads(1)
+    load = round(os.getloadavg()[0], 2)
+    set_up, frames = set_ups()
+    record = {
+        "date": time.strftime("%Y-%m-%d"),
+        "command": "python validation/error_time/break_even.py",
+        "environment": environment(),
+        "load": load,
+        "element": element_times(),
+        "frames": frames,
+        "set_up": set_up,
+    }
+    write_text(RECORD, json.dumps(record, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    sys.path.insert(0, str(HERE.parent))
+    main()
