@@ -1,0 +1,53 @@
+"""Stability: extreme scenes by the default integrator, five horizons, a hundred thousand steps."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import battery
+import common
+import horizon
+import long_runs
+from harness import load, read_expectations
+
+HERE = Path(__file__).parent
+COUNTS = "Runs by element and integrator"
+QUICK = ("1 cell, generalised-alpha", "1 cell, generalised-alpha, floor")
+FEW = 500
+"""Steps of a quick run."""
+
+
+def parts(quick: bool) -> dict[str, Callable[[], common.Outcome]]:
+    """A part for each scene of the battery, scene of `horizon` and long run."""
+    scenes = battery.scenarios()
+    chosen = QUICK if quick else tuple(scenes)
+    out = {f"battery, {name}": partial(battery.part, scenes[name]) for name in chosen}
+    if quick:
+        few = ("twisted", "learned", "generalised-alpha", FEW)
+        return out | {"long": partial(long_runs.part, *few)}
+    for label in (*horizon.BODIES, *horizon.MOTIONS):
+        out[f"horizon, {label}"] = partial(horizon.part, label)
+    for case in long_runs.CASES:
+        for element in long_runs.ELEMENTS:
+            for scheme in long_runs.SCHEMES:
+                name = f"long, {case}, {element}, {scheme}"
+                out[name] = partial(long_runs.part, case, element, scheme)
+    return out
+
+
+def summary(record: common.Record) -> common.Outcome:
+    """The outcome of each run of the battery, and their numbers."""
+    expected = read_expectations(HERE / "expected.json")
+    stress = load(HERE.parent / "results" / "stress.json")
+    assert stress is not None
+    rows = battery.recorded_rows(stress.figures) + battery.judged_rows(record.figures, expected)
+    counts = battery.counts(rows)
+    figures = {f"{kind[0]}, {kind[1]}, runs that fail": kind[-1] for kind in counts}
+    heads = ("element", "integrator", *battery.OUTCOMES)
+    tables = (
+        common.Table(battery.RUNS, battery.RUN_HEADS, tuple(rows)),
+        common.Table(COUNTS, heads, counts),
+    )
+    return common.Outcome(figures, tables)
