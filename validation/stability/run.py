@@ -29,12 +29,9 @@ def parts(quick: bool) -> dict[str, Callable[[], common.Outcome]]:
         return out | {"long": partial(long_runs.part, *few)}
     for label in (*horizon.BODIES, *horizon.MOTIONS):
         out[f"horizon, {label}"] = partial(horizon.part, label)
-    for case in long_runs.CASES:
-        for element in long_runs.ELEMENTS:
-            for scheme in long_runs.SCHEMES:
-                name = f"long, {case}, {element}, {scheme}"
-                out[name] = partial(long_runs.part, case, element, scheme)
-    return out
+    return out | {
+        f"long, {', '.join(run)}": partial(long_runs.part, *run) for run in long_runs.RUNS
+    }
 
 
 def summary(record: common.Record) -> common.Outcome:
