@@ -46,9 +46,9 @@ def part(label: str) -> common.Outcome:
         for name in runs_of(label):
             found = of_run(name, scene, motion, frames)
             early, late, last, amplitude = found
-            key = f"{label}, {name}"
-            figures |= {f"{key}, horizon, %": early, f"{key}, five horizons, %": late,
-                        f"{key}, growth": late / early, f"{key}, amplitude, %": amplitude}  # fmt: skip
+            of = {"horizon, %": early, "five horizons, %": late, "growth": late / early,
+                  "amplitude, %": amplitude}  # fmt: skip
+            figures |= {f"{label}, {name}, {what}": x for what, x in of.items()}
             rows.append((label, name, float(frames), early, late, last, amplitude))
         for name in ("learned, 1", "learned, 2"):
             over = figures[f"{label}, {name}, five horizons, %"]
