@@ -1,4 +1,4 @@
-"""Energy of an undamped body over a hundred thousand steps, free and on a floor."""
+"""Energy of an undamped body over very many steps, free and on a floor."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 
 import pdcorrect as pc
 
-STEPS = 100_000
+STEPS, SHORTER = 100_000, 10_000
 CELL, STEP, YOUNG, DENSITY, GRAVITY = 0.05, 0.0025, 1e5, 1e3, 9.81
 """m, s, Pa, kg/m3, m/s2; waves cross half a cell in a step."""
 TWIST, DROP = 60.0, 0.1
@@ -20,16 +20,18 @@ SCHEMES: dict[str, dict[str, Any]] = {
     "generalised-alpha, radius 1": {"integrator": "generalised-alpha", "spectral_radius": 1.0},
     "midpoint": {"integrator": "midpoint"},
 }
-RUNS = (
-    *(("twisted", "learned", scheme) for scheme in SCHEMES),
-    ("twisted", "best coarse", "generalised-alpha"),
-    *(("dropped", "learned", scheme) for scheme in SCHEMES),
-    ("dropped", "best coarse", "generalised-alpha"),
-)
-"""Start, element and integrator."""
-TABLE = "Energy of 100 000 steps over that of the start"
+DEFAULT = "generalised-alpha"
+RUNS = {
+    ("twisted", "learned", DEFAULT): STEPS,
+    **{("twisted", "learned", scheme): SHORTER for scheme in SCHEMES if scheme != DEFAULT},
+    ("twisted", "best coarse", DEFAULT): SHORTER,
+    **{("dropped", "learned", scheme): SHORTER for scheme in SCHEMES},
+    ("dropped", "best coarse", DEFAULT): SHORTER,
+}
+"""Steps by start, element and integrator."""
+TABLE = "Energy of long runs over that of the start"
 HEADS = (
-    "body", "element", "integrator", "steps", "largest", "step 10 000", "last", "drift",
+    "body", "element", "integrator", "steps", "largest", "a tenth", "last", "drift",
     "steps that failed",
 )  # fmt: skip
 FIELDS = "kinetic_energy", "elastic_energy", "contact_energy"
@@ -45,7 +47,7 @@ def problem_of(case: str, element: str, scheme: str) -> pc.Problem:
     scene = pc.Scene(
         body={"shape": "beam", "cells": [3, 1, 1], "cell_size": CELL},
         material={"young": YOUNG, "poisson": 0.4, "density": DENSITY},
-        time={"step": STEP, "frames": STEPS, **SCHEMES[scheme]},
+        time={"step": STEP, "frames": 1, **SCHEMES[scheme]},
         **sections,
     )  # fmt: skip
     return pc.discretise(ELEMENTS[element](scene))
@@ -84,7 +86,7 @@ def energies(case: str, element: str, scheme: str, steps: int) -> tuple[np.ndarr
     return np.array(out), failed
 
 
-def part(case: str, element: str, scheme: str, steps: int = STEPS) -> common.Outcome:
+def part(case: str, element: str, scheme: str, steps: int) -> common.Outcome:
     """A run; the drift is the mean of the last tenth less that of the second, over the start."""
     found, failed = energies(case, element, scheme, steps)
     found, tenth = found / found[0], steps // 10
