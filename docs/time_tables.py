@@ -94,6 +94,20 @@ def unlike_families() -> Rows:
     return ("run, substeps", *(row[0] for row in rows[-4:]), "ms a frame"), cells
 
 
+def horizons() -> Rows:
+    """Errors at the horizon, at five times it, and of the amplitude, %, by scene and run."""
+    rows = table_of("stability", "Errors at the horizon and at five times it, %")[1]
+    found: dict[str, dict[str, str]] = {}
+    for scene, run, _, early, late, _, amplitude in rows:
+        column = "corrector" if run.startswith("hybrid") else run
+        told = f"{number(early, 2)} → {number(late, 2)} ({amplitude:+.1f})"
+        found.setdefault(scene, {})[column] = told
+    runs = list(dict.fromkeys(column for row in found.values() for column in row))
+    return ("scene", *runs), [
+        [scene, *(row.get(r, "") for r in runs)] for scene, row in found.items()
+    ]
+
+
 def aims(case: str) -> Rows:
     """What was aimed at before a case was first run, and what was reached."""
     figures = read(RECORDS / f"{case}.json")["figures"]
@@ -111,8 +125,7 @@ def tables() -> Iterator[tuple[str, Callable[[], Rows]]]:
     """By name."""
     yield "time-errors", errors
     yield "energy-long", partial(as_measured, "energy", "Energy over that of the start")
-    for which, start in (("twist", "Stiff body let go twisted"), ("weight", "Stiff body under")):
-        yield f"energy-{which}", partial(starting, "energy", start)
+    yield "energy-twist", partial(starting, "energy", "Stiff body let go twisted")
     yield "energy-errors", partial(as_measured, "energy", "Errors, % of the RMS displacement")
     yield "turek-hron-rest", partial(as_measured, "turek_hron", "CSM1", 4)
     yield "turek-hron-swing", partial(as_measured, "turek_hron", "CSM3", 4)
@@ -125,6 +138,10 @@ def tables() -> Iterator[tuple[str, Callable[[], Rows]]]:
     yield "aims", partial(aims, "unlike_families")
     yield "frequencies", partial(as_measured, "unlike_families", FREQUENCIES)
     yield "columns", partial(as_measured, "columns", "Columns")
+    yield "stability-outcomes", partial(as_measured, "stability", "Runs by element and integrator")
+    yield "stability-horizon", horizons
+    long = "Energy of long runs over that of the start"
+    yield "stability-long", partial(as_measured, "stability", long, columns=slice(0, 8))
     yield "spinning-cube", partial(as_measured, "columns", "Spinning cube", 2)
 
 
