@@ -15,7 +15,7 @@ import pdcorrect as pc
 from pdcorrect.errors import ConvergenceError, PdcorrectWarning
 
 error_time = Case(Path(__file__).parents[1] / "error_time").module
-SCENES = ("cantilever",)
+SCENES = ("cantilever", "angle", "portal", "plate", "impulse", "torsion")
 RUNS = ("best coarse, 1", "learned, 1", "learned, 2", "hex27, 1")
 LONGER = 5
 TABLE = "Errors at the horizon and at five times it, %"
