@@ -21,7 +21,6 @@ from pdcorrect.fem import energies
 from pdcorrect.fem.decomposition import nearest_volume_lanes
 from pdcorrect.fem.hyperelasticity import energy_code
 
-VARIANTS = ["hex8", "hex8-mean", "hex8-bubble", "hex8-bubble-mean", "hex8-enhanced"]
 DEVICES = [
     "cpu",
     pytest.param(
@@ -176,11 +175,13 @@ def test_a_dozen_unlike_scenes_step_as_each_alone(device):
 @on_every_device
 @pytest.mark.parametrize(
     ("element", "first_hessian"),
-    [(element, "rest") for element in VARIANTS[1:]]
-    + [("hex8-bubble-mean", "G"), ("hex8-enhanced", "G-scaled")],
-)
+    [
+        ("hex8-mean", "rest"), ("hex8-bubble", "rest"), ("hex8-bubble-mean", "G"),
+        ("hex8-enhanced", "G-scaled"),
+    ],
+)  # fmt: skip
 def test_so_they_do_with_every_element_and_first_hessian(element, first_hessian, device):
-    problems = [pc.discretise(unlike(seed, element)) for seed in range(4)]
+    problems = [pc.discretise(unlike(seed, element)) for seed in range(3)]
     states = moving_states(problems)
     stepper = pc.BatchStepper(
         problems, 1e-9, first_hessian=first_hessian, device=device, recover=False
