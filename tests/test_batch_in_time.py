@@ -120,7 +120,7 @@ def test_a_layer_differentiates_through_the_memory_of_its_steps(integrator, mode
     x, v = start.positions, start.velocities.clone().requires_grad_()
     rng = np.random.default_rng(2)
     weight = torch.as_tensor(rng.normal(size=x.shape))
-    layer = pc.PDLayer(stepper, 3, mode=mode, tolerance=1e-10)
+    layer = pc.PDLayer(stepper, 2, mode=mode, tolerance=1e-10)
 
     def loss(v):
         positions, velocities = layer(x, v)

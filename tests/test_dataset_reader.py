@@ -198,7 +198,9 @@ def test_cells_and_edges_of_a_batch_stay_within_their_graphs(folder):
     assert sorted(TrajectoryLoader(part, 2).order()) == [0, 1, 2]
 
 
-@pytest.mark.parametrize(("method", "count"), [(None, 0), ("fork", 2), ("spawn", 1)])
+@pytest.mark.parametrize(
+    ("method", "count"), [(None, 0), ("fork", 2), pytest.param("spawn", 1, marks=pytest.mark.slow)]
+)
 def test_the_loader_of_pytorch_geometric_hands_out_the_same(folder, method, count):
     dataset = opened(folder)
     dataset[0]  # the parent has read something

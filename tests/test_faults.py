@@ -376,7 +376,7 @@ def namespaces():
 @pytest.mark.parametrize(
     ("program", "fault", "times"),
     [
-        pytest.param(p, f, 2 if quick else 6, id=f"{p.name}-{f.__name__}",
+        pytest.param(p, f, (1 + (f is read_only_folder)) if quick else 6, id=f"{p.name}-{f.__name__}",
                      marks=() if quick else pytest.mark.slow)
         for p in PROGRAMS
         for f in FAULTS

@@ -70,12 +70,12 @@ def test_scikit_fem_is_imported_in_one_place():
     assert users == ["fem.operators"]
 
 
-def loaded_after(code):
-    script = (
-        f"{code}\nimport sys; print(' '.join(sorted({{m.split('.')[0] for m in sys.modules}})))"
-    )
+def loaded_after(*codes):
+    """Packages that are loaded after each of these programs, one after another."""
+    tell = "import sys; print('loaded', *{m.split('.')[0] for m in sys.modules})"
+    script = "\n".join(f"{code}\n{tell}" for code in codes)
     out = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
-    return set(out.stdout.splitlines()[-1].split())
+    return [set(line.split()) for line in out.stdout.splitlines() if line.startswith("loaded")]
 
 
 HEAVY = {"torch", "pyvista", "vtk", "vtkmodules", "h5py", "meshio", "matplotlib"}
@@ -91,6 +91,16 @@ try:
 except SystemExit:
     pass
 """
+CHECK = f"""
+import sys
+sys.modules["torch"] = None
+sys.argv = ["pdcorrect", "dataset", "check", {str(TINY)!r}]
+from pdcorrect.cli import main
+try:
+    main()
+except SystemExit as end:
+    assert not end.code
+"""
 STEPS = """
 import pdcorrect as pc
 body = {"shape": "beam", "cells": [2, 1, 1], "cell_size": 0.1}
@@ -105,30 +115,16 @@ WITHOUT_TORCH = (
 )  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    ("code", "heavy"),
-    [
-        pytest.param("import pdcorrect", LIBRARIES, id="import"),
-        pytest.param(HELP, LIBRARIES, id="help"),
-        pytest.param(STEPS, HEAVY, id="steps"),
-        pytest.param(
-            f"import {', '.join(f'pdcorrect.{name}' for name in WITHOUT_TORCH)}", {"torch"},
-            id="data sets, files, comparisons, pictures and the program",
-        ),
-    ],
-)  # fmt: skip
-def test_heavy_modules_are_not_loaded_until_needed(code, heavy):
-    assert not loaded_after(code) & heavy
+def test_heavy_modules_are_not_loaded_until_needed():
+    helped, stepped = loaded_after(HELP, STEPS)
+    assert not helped & LIBRARIES
+    assert not stepped & HEAVY
 
 
-def test_a_data_set_is_checked_without_torch():
-    code = (
-        "import sys\nsys.modules['torch'] = None\n"
-        "from pdcorrect.cli import main\n"
-        f"sys.argv = ['pdcorrect', 'dataset', 'check', {str(TINY)!r}]\nmain()"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
+def test_torch_is_not_loaded_by_what_does_without_it():
+    """Nor needed, where it is missing, by the check of a data set."""
+    loaded, _ = loaded_after(f"import {', '.join(f'pdcorrect.{x}' for x in WITHOUT_TORCH)}", CHECK)
+    assert "torch" not in loaded
 
 
 def test_public_names_exist():

@@ -470,7 +470,9 @@ def watched(monkeypatch, each_step=True):
     return kept, counts
 
 
-@pytest.mark.parametrize(("mode", "most"), [("unrolled", 16), ("checkpointed", 5)])
+@pytest.mark.parametrize(
+    ("mode", "most"), [pytest.param("unrolled", 16, marks=pytest.mark.slow), ("checkpointed", 5)]
+)
 def test_checkpointed_steps_keep_the_states_between_segments_only(mode, most, monkeypatch):
     stepper = small_batch()
     p, v, f = inputs(stepper)
