@@ -21,6 +21,7 @@ from pdcorrect.fem import energies
 from pdcorrect.fem.decomposition import nearest_volume_lanes
 from pdcorrect.fem.hyperelasticity import energy_code
 
+VARIANTS = ["hex8", "hex8-mean", "hex8-bubble", "hex8-bubble-mean", "hex8-enhanced"]
 DEVICES = [
     "cpu",
     pytest.param(

@@ -42,25 +42,24 @@ def imported(path):
             )
 
 
-GRAPH = {name: set(imported(path)) for name, path in MODULES.items() if name}
-"""The package itself is left out: it loads what it offers when that is first used."""
+@pytest.fixture(scope="module")
+def graph():
+    """Without the package itself, which loads what it offers when that is first used."""
+    return {name: set(imported(path)) for name, path in MODULES.items() if name}
 
 
-def test_every_folder_has_its_layer():
-    assert {name.split(".")[0] for name in GRAPH} == set(LAYERS)
+def test_imports_run_down_and_every_folder_has_its_layer(graph):
+    assert {name.split(".")[0] for name in graph} == set(LAYERS)
+    for name, others in graph.items():
+        here = name.split(".")[0]
+        for other in others - {""}:
+            there = other.split(".")[0]
+            assert there == here or LAYERS.index(there) < LAYERS.index(here), f"{name} uses {other}"
 
 
-@pytest.mark.parametrize("name", sorted(GRAPH))
-def test_imports_run_down(name):
-    here = name.split(".")[0]
-    for other in GRAPH[name] - {""}:
-        there = other.split(".")[0]
-        assert there == here or LAYERS.index(there) < LAYERS.index(here), f"{name} uses {other}"
-
-
-def test_no_modules_import_each_other():
+def test_no_modules_import_each_other(graph):
     try:
-        TopologicalSorter(GRAPH).prepare()
+        TopologicalSorter(graph).prepare()
     except CycleError as error:
         pytest.fail(" -> ".join(error.args[1]))
 

@@ -30,8 +30,6 @@ from pdcorrect.io import trajectory as files
 from pdcorrect.io.trajectory import TrajectoryWriter, load_trajectory
 from pdcorrect.solvers.rollout import StepLog, continue_from, differences
 
-LINUX = pytest.mark.skipif(sys.platform != "linux", reason="limits the file size as Linux does")
-
 
 def content(path):
     """All that a file holds but the wall-clock seconds, byte by byte."""
