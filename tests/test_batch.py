@@ -193,36 +193,6 @@ def test_so_they_do_with_every_element_and_first_hessian(element, first_hessian,
         assert furthest(alone(problem, state, 1), after) < 1e-9
 
 
-@pytest.mark.parametrize(
-    ("name", "memory"), [("bdf2", True), ("midpoint", False), ("generalised-alpha", True)]
-)
-def test_so_they_do_with_every_integrator(name, memory):
-    time = {"integrator": name}
-    problems = [pc.discretise(unlike(seed, time=time, damping={"mass": 0.5})) for seed in range(3)]
-    states = [alone(p, s, 1) for p, s in zip(problems, moving_states(problems), strict=True)]
-    assert bool(states[0].memory) is memory
-    found, _ = stepped(pc.BatchStepper(problems, 1e-9, recover=False), states, 2)
-    for problem, state, after in zip(problems, states, found, strict=True):
-        exact = alone(problem, state, 2)
-        assert furthest(exact, after) < 1e-9
-        np.testing.assert_allclose(after.velocities, exact.velocities, atol=1e-6)
-
-
-@on_every_device
-def test_company_and_order_do_not_matter(device):
-    problems = [pc.discretise(unlike(seed)) for seed in range(6)]
-    states = moving_states(problems)
-    whole, _ = stepped(pc.BatchStepper(problems, 1e-9, device=device), states, 2)
-    order = [4, 1, 5]
-    some, _ = stepped(
-        pc.BatchStepper([problems[i] for i in order], 1e-9, device=device),
-        [states[i] for i in order],
-        2,
-    )
-    for i, state in zip(order, some, strict=True):
-        assert furthest(whole[i], state) < 1e-9
-
-
 @pytest.mark.parametrize("element", ["hex8", "hex8-bubble-mean"])
 def test_scenes_that_differ_by_loads_alone_step_as_if_they_shared_nothing(element):
     """To the bit: what is computed once for them is what each would have by itself."""
@@ -318,21 +288,6 @@ def test_single_precision_reaches_a_loose_tolerance(device):
     for problem, after in zip(problems, found, strict=True):
         exact = alone(problem, problem.rest_state(), 2)
         assert furthest(exact, after) < 5e-3 * problem.cell_size
-
-
-def test_extra_forces_and_moving_clamps_act_as_on_one_scene():
-    turn = {"times": [0.0, 1.0], "rotation": [0.0, 90.0], "centre": [0, 0.02, 0.02], "axis": "x"}
-    clamps = [{"region": {"plane": "x", "at": 0.0}, "motion": turn}]
-    problems = [pc.discretise(unlike(seed, clamps=clamps)) for seed in (0, 2)]
-    states = [p.rest_state() for p in problems]
-    forces = [0.01 * np.random.default_rng(i).normal(size=s.positions.shape)
-              for i, s in enumerate(states)]  # fmt: skip
-    stepper = pc.BatchStepper(problems, 1e-9, recover=False)
-    padded = stepper.cells.nodal(forces)[:, : stepper.cells.sizes.nodes]
-    found = stepper.states(stepper(stepper.state(states), padded).state)
-    for problem, state, force, after in zip(problems, states, forces, found, strict=True):
-        exact = pc.ProjectiveDynamics(problem, 1e-9)(state, force).state
-        assert furthest(exact, after) < 1e-9
 
 
 def test_batches_that_cannot_be_are_refused_by_name():

@@ -70,7 +70,6 @@ def address(run_file):
             process.terminate()
 
 
-@pytest.mark.slow  # it starts the program, and all of trame
 def test_its_page_answers(address):
     with urllib.request.urlopen(address, timeout=10) as answer:
         assert answer.status == 200
