@@ -650,8 +650,7 @@ def test_wrong_input_is_refused_by_name():
         with pytest.raises(InputError, match=words):
             pc.adjoint(stepper, state, replace(result, status=status), g)
 
-
-def test_names_that_the_memory_does_not_have_are_refused():
+    # names that the memory does not have
     problem = pc.discretise(scene(time=timed("generalised-alpha")))
     stepper, state = pc.Newton(problem), problem.rest_state()
     result, g = stepper(state), np.ones_like(state.positions)

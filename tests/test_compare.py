@@ -175,6 +175,12 @@ def test_models_keep_the_reference_that_they_learned_from(thick):
         (case,) = (case for case in trained if case.label == label)
         assert case.problem(thick).element == "hex8-bubble-mean"
         assert case.problem(thick).refine == refine
+    scene = pc.best_coarse(thick)
+    plain = cases_for(scene, ["torsion-as-published"])
+    assert plain[:-1] == CASES
+    assert (plain[-1].label, plain[-1].base) == ("hybrid torsion-as-published", "plain")
+    with pytest.raises(InputError, match="best, plain"):
+        cases_for(scene, [MODEL, "torsion-as-published"])
 
 
 @pytest.mark.parametrize(
@@ -381,16 +387,6 @@ def test_compare_with_a_corrector_adds_it_and_the_model_that_it_corrects(program
     assert (about["base"], about["dataset"].split("+")[0]) == ("best", MODEL)
 
 
-def test_correctors_share_the_reference_of_their_base(thick):
-    pytest.importorskip("torch_geometric")
-    scene = pc.best_coarse(thick)
-    plain = cases_for(scene, ["torsion-as-published"])
-    assert plain[:-1] == CASES
-    assert (plain[-1].label, plain[-1].base) == ("hybrid torsion-as-published", "plain")
-    with pytest.raises(InputError, match="best, plain"):
-        cases_for(scene, [MODEL, "torsion-as-published"])
-
-
 def test_correctors_of_one_name_are_told_apart_and_cases_of_one_label_refused(tmp_path):
     pytest.importorskip("torch_geometric")
     models = [str(saved(tmp_path / name / "model", problems((3, 1, 1)))) for name in ("one", "two")]
@@ -402,12 +398,9 @@ def test_correctors_of_one_name_are_told_apart_and_cases_of_one_label_refused(tm
         pc.compare(beam((2, 1, 1)), cases=CASES[2:3] * 2)
 
 
-def test_comparisons_of_no_frames_are_refused():
+def test_bases_are_known_and_comparisons_of_no_frames_refused():
     with pytest.raises(InputError, match="frames = 0"):
         pc.compare(beam((2, 1, 1)), 0)
-
-
-def test_a_base_is_known():
     scene, case = beam((2, 1, 1)), CASES[1]
     with pytest.raises(InputError, match="base 'worst'"):
         dataclasses.replace(case, base="worst").problem(scene)

@@ -153,19 +153,6 @@ def test_what_is_not_there_is_named(folder, tmp_path):
         opened(folder).get(4 * STEPS)
 
 
-def test_damaged_files_are_refused_by_name(folder, tmp_path):
-    path = tmp_path / "training" / "mesh-0000.h5"
-    path.parent.mkdir()
-    path.write_bytes(b"nothing of the kind")
-    with pytest.raises(FileFormatError, match=r"mesh-0000\.h5"):
-        opened(tmp_path)
-    whole = (folder / "training" / "mesh-0000.h5").read_bytes()
-    dataset = opened(samples.write(tmp_path, [samples.shard()]))
-    path.write_bytes(whole[:-2000])
-    with pytest.raises(FileFormatError, match=r"mesh-0000\.h5"):
-        dataset[0]
-
-
 # --- batches ---------------------------------------------------------------------------
 
 
