@@ -1,6 +1,6 @@
 """``python -m pdcorrect.fem.vtk_process FILE TARGET``: VTK reads a file, in a process of its own.
 
-It imports what of VTK it needs, which starts three times as quickly as all of it or pyvista.
+It imports only what it needs of VTK, and so starts sooner than with pyvista.
 """
 
 from __future__ import annotations
