@@ -76,7 +76,6 @@ def test_links_lead_somewhere_and_files_that_are_named_exist(page):
         assert any((place / name).exists() for place in places), f"{page.name}: {name}"
 
 
-@pytest.mark.slow  # as `make docs` does
 def test_the_documentation_builds_without_warnings(tmp_path):
     command = [sys.executable, "-m", "sphinx", "-W", "-q", "-b", "html", ROOT / "docs", tmp_path]
     built = subprocess.run(command, capture_output=True, text=True)
