@@ -7,6 +7,9 @@ JOBS ?= 2
 # Python compiles what is imported when it is, which is a small part of what is installed.
 INSTALL := $(BIN)/python -m pip install --quiet --no-compile --disable-pip-version-check -c constraints.txt
 
+# What is imported is compiled once, not by each process, also where the environment says otherwise.
+unexport PYTHONDONTWRITEBYTECODE
+
 .PHONY: demo demo-learn test test-slow lint docs bench clean
 
 demo: $(VENV)/demo.stamp

@@ -1,6 +1,7 @@
 """Scenes and meshes that several tests share; all asymmetric on purpose."""
 
 import gc
+import multiprocessing
 import os
 import sys
 from dataclasses import replace
@@ -150,6 +151,30 @@ def program(capsys, monkeypatch):
         return status, out, err
 
     return call
+
+
+@pytest.fixture
+def fork():
+    """Call a function in a copy of this process, which imports nothing again.
+
+    Its first argument is a pipe; the other end of it comes back with the process.
+    """
+    if sys.platform != "linux":
+        pytest.skip("no safe copies of a process with libraries there")
+    context, started = multiprocessing.get_context("fork"), []
+
+    def start(function, *arguments):
+        here, there = context.Pipe()
+        process = context.Process(target=function, args=(there, *arguments), daemon=True)
+        process.start()
+        there.close()
+        started.append(process)
+        return process, here
+
+    yield start
+    for process in started:
+        process.kill()
+        process.join()
 
 
 @pytest.fixture

@@ -1,13 +1,12 @@
-"""Step one of five scenes, from bare to full, in a process of its own, and print what it used.
+"""Step five scenes, from bare to full, in a process of their own, and print what each used.
 
-    python pays_only_scene.py NAME [MESH_FILE]
+    python pays_only_scene.py MESH_FILE
 
 Run with ``NUMBA_DISABLE_JIT=1`` the kernels are plain functions, so that their calls are counted.
 """
 
 import gc
 import json
-import os
 import sys
 from collections import Counter
 from types import FunctionType, ModuleType
@@ -88,12 +87,11 @@ def held_bytes(*roots):
     return sum(buffers.values())
 
 
-def main(name, mesh_file=""):
-    """Two frames of a scene; the full one's body comes from a file."""
-    import pdcorrect as pc
+def main(mesh_file):
+    """Two frames of each scene; the full one's body comes from a file."""
     from pdcorrect.solvers import step
 
-    counts = Counter(dict.fromkeys([*COUNTED, "volume lanes", "damping"], 0))
+    counts = Counter()
     build = step.Rayleigh.__init__
 
     def damped(self, *arguments):
@@ -101,27 +99,33 @@ def main(name, mesh_file=""):
         build(self, *arguments)
 
     step.Rayleigh.__init__ = damped
-    if os.environ.get("NUMBA_DISABLE_JIT") == "1":
-        count_calls(counts)
-    body = {"body": {"shape": "file", "path": mesh_file}} if mesh_file else {}
-    problem = pc.discretise(pc.Scene(name=name, **{**SCENES[name], **body}))
+    count_calls(counts)
+    found = {}
+    for name, settings in SCENES.items():
+        counts.clear()
+        counts.update(dict.fromkeys([*COUNTED, "volume lanes", "damping"], 0))
+        body = {"body": {"shape": "file", "path": mesh_file}} if name == "full" else {}
+        found[name] = used({**settings, **body}) | {"counts": dict(counts)}
+    print(json.dumps(found))
+
+
+def used(settings):
+    """What stepping one scene used."""
+    import pdcorrect as pc
+
+    problem = pc.discretise(pc.Scene(**settings))
     stepper = pc.ProjectiveDynamics(problem)
     run = pc.rollout(stepper)
-    print(
-        json.dumps(
-            {
-                "statuses": run.stats["status"].tolist(),
-                "counts": counts,
-                "modules": sorted(sys.modules),
-                "problem_bytes": held_bytes(problem),
-                "bytes": held_bytes(problem, stepper),
-                "sizes": [len(problem.positions), len(problem.cells)],
-                "lanes": problem.quadrature.lanes.shape,
-                "loads": [held_bytes(load) for load in problem.loads],
-                "clamps": held_bytes(problem.clamps),
-            }
-        )
-    )
+    return {
+        "statuses": run.stats["status"].tolist(),
+        "modules": sorted(sys.modules),  # also of the scenes before, which are barer
+        "problem_bytes": held_bytes(problem),
+        "bytes": held_bytes(problem, stepper),
+        "sizes": [len(problem.positions), len(problem.cells)],
+        "lanes": problem.quadrature.lanes.shape,
+        "loads": [held_bytes(load) for load in problem.loads],
+        "clamps": held_bytes(problem.clamps),
+    }
 
 
 if __name__ == "__main__":

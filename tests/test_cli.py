@@ -77,17 +77,6 @@ def test_vtu_files_hold_the_stress_at_the_nodes(program, tmp_path, element):
     assert 100 < data["von_mises"].max() < 1e5
 
 
-def test_an_existing_file_is_kept_unless_told(program, scene_file, tmp_path):
-    output = tmp_path / "run.h5"
-    output.write_text("precious")
-    status, _, err = program("simulate", scene_file, "-o", output)
-    assert status != 0
-    assert "run.h5" in err
-    assert output.read_text() == "precious"
-    assert program("simulate", scene_file, "-o", output, "--overwrite", "--frames", 1)[0] == 0
-    assert len(pc.load_trajectory(output)) == 1
-
-
 def test_no_output_is_replaced_unless_told(program, tmp_path, monkeypatch):
     probes = [{"name": "end", "point": [0.08, 0, 0]}]
     scene, run = tmp_path / "scene.toml", tmp_path / "run.h5"

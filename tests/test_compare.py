@@ -175,6 +175,12 @@ def test_models_keep_the_reference_that_they_learned_from(thick):
         (case,) = (case for case in trained if case.label == label)
         assert case.problem(thick).element == "hex8-bubble-mean"
         assert case.problem(thick).refine == refine
+    scene = pc.best_coarse(thick)
+    plain = cases_for(scene, ["torsion-as-published"])
+    assert plain[:-1] == CASES
+    assert (plain[-1].label, plain[-1].base) == ("hybrid torsion-as-published", "plain")
+    with pytest.raises(InputError, match="best, plain"):
+        cases_for(scene, [MODEL, "torsion-as-published"])
 
 
 @pytest.mark.parametrize(
@@ -301,9 +307,10 @@ def test_series_of_rows_that_are_gone_are_deleted_or_told(program, thick, tmp_pa
 # --- errors to the converged motion ------------------------------------------------------
 
 
-def test_errors_to_the_converged_motion_come_first(program, thick, tmp_path, monkeypatch):
+def test_errors_to_the_converged_motion_come_first(program, tmp_path, monkeypatch):
     monkeypatch.setenv("PDCORRECT_CACHE", str(tmp_path / "cache"))
-    scene = thick.with_changes(time={"integrator": "generalised-alpha", "step": 1e-3, "frames": 2})
+    time = {"integrator": "generalised-alpha", "step": 1e-3, "frames": 1}
+    scene = beam((2, 2, 2), time=time)
     (tmp_path / "scene.toml").write_text(scene.to_toml())
     folder = tmp_path / "report"
     options = ("--converged-error", "--estimate-error")
@@ -380,16 +387,6 @@ def test_compare_with_a_corrector_adds_it_and_the_model_that_it_corrects(program
     assert (about["base"], about["dataset"].split("+")[0]) == ("best", MODEL)
 
 
-def test_correctors_share_the_reference_of_their_base(thick):
-    pytest.importorskip("torch_geometric")
-    scene = pc.best_coarse(thick)
-    plain = cases_for(scene, ["torsion-as-published"])
-    assert plain[:-1] == CASES
-    assert (plain[-1].label, plain[-1].base) == ("hybrid torsion-as-published", "plain")
-    with pytest.raises(InputError, match="best, plain"):
-        cases_for(scene, [MODEL, "torsion-as-published"])
-
-
 def test_correctors_of_one_name_are_told_apart_and_cases_of_one_label_refused(tmp_path):
     pytest.importorskip("torch_geometric")
     models = [str(saved(tmp_path / name / "model", problems((3, 1, 1)))) for name in ("one", "two")]
@@ -401,12 +398,9 @@ def test_correctors_of_one_name_are_told_apart_and_cases_of_one_label_refused(tm
         pc.compare(beam((2, 1, 1)), cases=CASES[2:3] * 2)
 
 
-def test_comparisons_of_no_frames_are_refused():
+def test_bases_are_known_and_comparisons_of_no_frames_refused():
     with pytest.raises(InputError, match="frames = 0"):
         pc.compare(beam((2, 1, 1)), 0)
-
-
-def test_a_base_is_known():
     scene, case = beam((2, 1, 1)), CASES[1]
     with pytest.raises(InputError, match="base 'worst'"):
         dataclasses.replace(case, base="worst").problem(scene)

@@ -1,9 +1,6 @@
 """The converged motion: what it is, how exact it says that it is, and its cache."""
 
 import dataclasses
-import os
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -221,11 +218,11 @@ def test_the_cache_lies_where_the_environment_says(monkeypatch, tmp_path):
     assert module.cache_folder("x") == tmp_path / ".cache" / "pdcorrect" / "x"
 
 
-def test_two_writers_leave_one_whole_entry(scene, computed, cache, tmp_path):
-    (tmp_path / "scene.toml").write_text(scene.to_toml())
-    code = f"import pdcorrect as pc\npc.converged(pc.Scene.load({str(tmp_path / 'scene.toml')!r}))"
-    writers = [subprocess.Popen([sys.executable, "-c", code], env=os.environ) for _ in range(2)]
-    assert [writer.wait() for writer in writers] == [0, 0]
+def test_two_writers_leave_one_whole_entry(scene, computed, cache, fork):
+    writers = [fork(lambda _: pc.converged(scene)) for _ in range(2)]
+    for process, _ in writers:
+        process.join()
+        assert process.exitcode == 0
     assert [path.suffix for path in cache.iterdir()] == [".h5"]
     pc.converged(scene)
     assert computed == []

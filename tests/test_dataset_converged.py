@@ -164,6 +164,7 @@ def test_the_reference_is_what_errors_are_measured_from(monkeypatch, tmp_path):
     np.testing.assert_allclose(kept.velocities, run.velocities, atol=1e-4 * size)
 
 
+@pytest.mark.slow  # test_dataset_generate compares batches of smaller runs
 def test_batches_compute_the_same(original):
     pytest.importorskip("torch")
     from pdcorrect.data.batch_engine import Batched

@@ -376,11 +376,11 @@ def namespaces():
 @pytest.mark.parametrize(
     ("program", "fault", "times"),
     [
-        pytest.param(p, f, 2 if quick else 6, id=f"{p.name}-{f.__name__}",
+        pytest.param(p, f, times if quick else 6, id=f"{p.name}-{f.__name__}",
                      marks=() if quick else pytest.mark.slow)
         for p in PROGRAMS
         for f in FAULTS
-        for quick in [(p.name, f.__name__) in QUICK]
+        for quick, times in [((p.name, f.__name__) in QUICK, 2 if f is read_only_folder else 1)]
     ],
 )  # fmt: skip
 def test_whatever_happens_the_same_command_ends_with_the_same_result(

@@ -283,7 +283,9 @@ def test_runs_over_each_other_have_the_colours_of_the_legend(run, fine, tmp_path
         assert inked.max() > 0.3 * legend.shape[1]
         assert paper(legend[:, -5:]).all()
     # of a finer run, the coarse one's cells
-    assert figures.render_overlay([run, fine], tmp_path / "b.png", labels=["1", "2"]).exists()
+    assert figures.render_overlay(
+        [run, fine], tmp_path / "b.png", labels=["1", "2"], window=WIDTH
+    ).exists()
 
 
 def test_a_picture_has_the_size_that_is_asked_for(run, tmp_path):

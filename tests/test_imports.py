@@ -42,40 +42,37 @@ def imported(path):
             )
 
 
-GRAPH = {name: set(imported(path)) for name, path in MODULES.items() if name}
-"""The package itself is left out: it loads what it offers when that is first used."""
+@pytest.fixture(scope="module")
+def graph():
+    """Without the package itself, which loads what it offers when that is first used."""
+    return {name: set(imported(path)) for name, path in MODULES.items() if name}
 
 
-def test_every_folder_has_its_layer():
-    assert {name.split(".")[0] for name in GRAPH} == set(LAYERS)
+def test_imports_run_down_and_every_folder_has_its_layer(graph):
+    assert {name.split(".")[0] for name in graph} == set(LAYERS)
+    for name, others in graph.items():
+        here = name.split(".")[0]
+        for other in others - {""}:
+            there = other.split(".")[0]
+            assert there == here or LAYERS.index(there) < LAYERS.index(here), f"{name} uses {other}"
+    assert [name for name, path in MODULES.items() if "skfem" in path.read_text()] == [
+        "fem.operators"
+    ]
 
 
-@pytest.mark.parametrize("name", sorted(GRAPH))
-def test_imports_run_down(name):
-    here = name.split(".")[0]
-    for other in GRAPH[name] - {""}:
-        there = other.split(".")[0]
-        assert there == here or LAYERS.index(there) < LAYERS.index(here), f"{name} uses {other}"
-
-
-def test_no_modules_import_each_other():
+def test_no_modules_import_each_other(graph):
     try:
-        TopologicalSorter(GRAPH).prepare()
+        TopologicalSorter(graph).prepare()
     except CycleError as error:
         pytest.fail(" -> ".join(error.args[1]))
 
 
-def test_scikit_fem_is_imported_in_one_place():
-    users = [module_name(p) for p in SOURCE.rglob("*.py") if "skfem" in p.read_text()]
-    assert users == ["fem.operators"]
-
-
-def loaded_after(code):
-    script = (
-        f"{code}\nimport sys; print(' '.join(sorted({{m.split('.')[0] for m in sys.modules}})))"
-    )
+def loaded_after(*codes):
+    """Packages that are loaded after each of these programs, one after another."""
+    tell = "import sys; print('loaded', *{m.split('.')[0] for m in sys.modules})"
+    script = "\n".join(f"{code}\n{tell}" for code in codes)
     out = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
-    return set(out.stdout.splitlines()[-1].split())
+    return [set(line.split()) for line in out.stdout.splitlines() if line.startswith("loaded")]
 
 
 HEAVY = {"torch", "pyvista", "vtk", "vtkmodules", "h5py", "meshio", "matplotlib"}
@@ -91,6 +88,16 @@ try:
 except SystemExit:
     pass
 """
+CHECK = f"""
+import sys
+sys.modules["torch"] = None
+sys.argv = ["pdcorrect", "dataset", "check", {str(TINY)!r}]
+from pdcorrect.cli import main
+try:
+    main()
+except SystemExit as end:
+    assert not end.code
+"""
 STEPS = """
 import pdcorrect as pc
 body = {"shape": "beam", "cells": [2, 1, 1], "cell_size": 0.1}
@@ -105,30 +112,16 @@ WITHOUT_TORCH = (
 )  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    ("code", "heavy"),
-    [
-        pytest.param("import pdcorrect", LIBRARIES, id="import"),
-        pytest.param(HELP, LIBRARIES, id="help"),
-        pytest.param(STEPS, HEAVY, id="steps"),
-        pytest.param(
-            f"import {', '.join(f'pdcorrect.{name}' for name in WITHOUT_TORCH)}", {"torch"},
-            id="data sets, files, comparisons, pictures and the program",
-        ),
-    ],
-)  # fmt: skip
-def test_heavy_modules_are_not_loaded_until_needed(code, heavy):
-    assert not loaded_after(code) & heavy
+def test_heavy_modules_are_not_loaded_until_needed():
+    helped, stepped = loaded_after(HELP, STEPS)
+    assert not helped & LIBRARIES
+    assert not stepped & HEAVY
 
 
-def test_a_data_set_is_checked_without_torch():
-    code = (
-        "import sys\nsys.modules['torch'] = None\n"
-        "from pdcorrect.cli import main\n"
-        f"sys.argv = ['pdcorrect', 'dataset', 'check', {str(TINY)!r}]\nmain()"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
+def test_torch_is_not_loaded_by_what_does_without_it():
+    """Nor needed, where it is missing, by the check of a data set."""
+    loaded, _ = loaded_after(f"import {', '.join(f'pdcorrect.{x}' for x in WITHOUT_TORCH)}", CHECK)
+    assert "torch" not in loaded
 
 
 def test_public_names_exist():

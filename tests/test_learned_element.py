@@ -28,6 +28,10 @@ from pdcorrect.solvers.integrators import backward_euler
 from pdcorrect.solvers.step import StepObjective
 
 OUTPUTS = 171 + 28
+SMALL_CROSS = {
+    "shape": "cross", "cells": [4, 2, 1], "cell_size": 0.05, "arms": 2, "arm_start": 2,
+    "arm_width": 1, "arm_length": 1,
+}  # fmt: skip
 DAMPINGS = [{}, {"stiffness": 1e-3, "viscosity": 1e-3}, {"mass": 3.0}]
 
 
@@ -515,7 +519,8 @@ def test_second_order_under_refinement():
 
 def batch_of_two(damping):
     problems = [
-        learned_problem(s) for s in (two_materials(damping=damping), cross(damping=damping))
+        learned_problem(s)
+        for s in (two_materials(damping=damping), cross(damping=damping, body=SMALL_CROSS))
     ]
     return problems, pc.BatchStepper(problems, 1e-10)
 
@@ -524,14 +529,14 @@ def batch_of_two(damping):
 def test_batches_equal_single_steps(damping):
     problems, stepper = batch_of_two(damping)
     state = stepper.rest_state()
-    for _ in range(4):
+    for _ in range(3):
         state = stepper(state).state
     for i, problem in enumerate(problems):
-        single = pc.rollout(pc.ProjectiveDynamics(problem, tolerance=1e-10), 4).positions[-1]
+        single = pc.rollout(pc.ProjectiveDynamics(problem, tolerance=1e-10), 3).positions[-1]
         assert state.positions[i, : len(single)].numpy() == pytest.approx(single, abs=1e-10)
 
 
-@pytest.mark.parametrize("damping", DAMPINGS, ids=str)
+@pytest.mark.parametrize("damping", DAMPINGS[:2], ids=str)
 def test_derivatives_of_batches_equal_those_of_single_steps(damping):
     problems, batch = batch_of_two(damping)
     before = batch(batch.rest_state()).state

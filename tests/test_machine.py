@@ -80,7 +80,7 @@ def test_blas_has_its_threads_back_after_steps_in_two():
     subprocess.run([sys.executable, "-c", STEPS_IN_TWO_THREADS], check=True, env=settings)
 
 
-@pytest.mark.parametrize("command", ["simulate", "compare"])
+@pytest.mark.parametrize("command", ["simulate", pytest.param("compare", marks=pytest.mark.slow)])
 def test_threads_are_set_before_the_kernels_are_loaded(command):
     script = f"""
 import os, sys

@@ -7,6 +7,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+import numba
 import numpy as np
 import pytest
 
@@ -85,16 +86,6 @@ def test_local_global_reaches_the_same_state():
     assert plain.status is quasi.status is pc.Status.CONVERGED
     assert plain.iterations > 3 * quasi.iterations
     np.testing.assert_allclose(plain.state.positions, quasi.state.positions, atol=1e-9)
-
-
-@pytest.mark.parametrize("hessian", ["G", "G-scaled"])
-def test_the_first_hessian_does_not_change_the_answer(hessian):
-    problem = pc.discretise(cross())
-    result = pc.ProjectiveDynamics(problem, tolerance=1e-8, first_hessian=hessian)(
-        problem.rest_state()
-    )
-    exact = pc.Newton(problem)(problem.rest_state())
-    np.testing.assert_allclose(result.state.positions, exact.state.positions, atol=1e-9)
 
 
 @pytest.mark.parametrize("rule", ["lumped", "averaged", "consistent", "per-node"])
@@ -379,19 +370,19 @@ def test_a_run_does_not_depend_on_the_number_of_threads():
     code = (
         "import sys; sys.path.insert(0, sys.argv[1])\n"
         "from conftest import cross\n"
-        "import hashlib, pdcorrect as pc\n"
+        "import pdcorrect as pc\n"
         "run = pc.rollout(pc.ProjectiveDynamics(pc.discretise(cross(), refine=2)), 2)\n"
-        "print(hashlib.sha256(run.positions.tobytes()).hexdigest())"
+        "sys.stdout.buffer.write(run.positions.tobytes())"
     )
-    hashes = {
-        subprocess.run(
-            [sys.executable, "-c", code, str(Path(__file__).parent)],
-            env={**os.environ, "NUMBA_NUM_THREADS": threads},
-            capture_output=True, text=True, check=True,
-        ).stdout
-        for threads in ("1", "2")
-    }  # fmt: skip
-    assert len(hashes) == 1
+    two = subprocess.run(
+        [sys.executable, "-c", code, str(Path(__file__).parent)],
+        env={**os.environ, "NUMBA_NUM_THREADS": "2"}, capture_output=True, check=True,
+    ).stdout  # fmt: skip
+    before = numba.get_num_threads()
+    numba.set_num_threads(1)
+    one = pc.rollout(pc.ProjectiveDynamics(pc.discretise(cross(), refine=2)), 2)
+    numba.set_num_threads(before)
+    assert one.positions.tobytes() == two
 
 
 # --- factors stay right --------------------------------------------------------------------

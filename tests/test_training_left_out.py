@@ -45,8 +45,8 @@ def test_simulations_of_unlike_lengths_are_stepped_together_as_alone(tmp_path):
 
 
 STAGES = (
-    samples.one_step(iterations=6, batch=6),
-    samples.unrolled(iterations=4, steps=(2,), start="pool", batch=3, loss={"ahead": 1.0}),
+    samples.one_step(iterations=3, batch=6),
+    samples.unrolled(iterations=2, steps=(2,), start="pool", batch=3, loss={"ahead": 1.0}),
 )
 
 
@@ -60,7 +60,7 @@ def several(tmp_path):
 
 
 def test_what_is_left_out_might_as_well_not_be_there(several, tmp_path, few_threads):
-    whole = samples.config(*STAGES, validate_every={"iterations": 4})
+    whole = samples.config(*STAGES, validate_every={"iterations": 3})
     config = whole.model_copy(update={"without": LEFT_OUT})
     Training(config, several, tmp_path / "left out").run()
     for name in LEFT_OUT:

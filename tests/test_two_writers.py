@@ -3,8 +3,6 @@
 import os
 import subprocess
 import sys
-import textwrap
-from pathlib import Path
 
 import h5py
 import numpy as np
@@ -16,43 +14,31 @@ from pdcorrect.errors import OutputError
 from pdcorrect.io.trajectory import TrajectoryWriter, load_trajectory, save_trajectory
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="no locks there")
-WRITER = """
-    import sys
-    from motion import trajectory
-    from pdcorrect.io.trajectory import TrajectoryWriter
-    run = trajectory()
-    writer = TrajectoryWriter(sys.argv[1], run.points, run.cells, run.state(0), overwrite=True)
-    with writer:
-        for k in range(len(run)):
-            values = {name: array[k] for name, array in run.stats.items()}
-            writer.append_values(run.state(k + 1), values)
-            print(k, flush=True)
-            if k == 2 and sys.stdin.readline() == "again\\n":
-                values["late"] = 1.0
-"""
+
+
+def write(pipe, path):
+    """Three frames, and the rest when told to, with another statistic if it is given a name."""
+    run, late = trajectory(), {}
+    try:
+        with writer_of(path, run) as writer:
+            for k in range(len(run)):
+                values = {name: array[k] for name, array in run.stats.items()}
+                writer.append_values(run.state(k + 1), values | late)
+                if k == 2:
+                    pipe.send("begun")
+                    late = dict.fromkeys(pipe.recv(), 1.0)
+    except OutputError as error:
+        pipe.send(str(error))
+    else:
+        pipe.send("done")
 
 
 @pytest.fixture
-def other(tmp_path):
-    """A process that writes three frames, and the rest when it is told to."""
-    started = []
-
-    def start(script=WRITER, **environment):
-        path = os.pathsep.join([str(Path(__file__).parent), *sys.path])
-        process = subprocess.Popen(
-            [sys.executable, "-c", textwrap.dedent(script), str(tmp_path / "run.h5")],
-            env={**os.environ, "PYTHONPATH": path, **environment}, text=True,
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-        )  # fmt: skip
-        started.append(process)
-        for k in range(3):
-            assert process.stdout.readline() == f"{k}\n"
-        return process
-
-    yield start
-    for process in started:
-        process.kill()
-        process.communicate()
+def other(fork, tmp_path):
+    """A process that has written three frames, and a pipe to it."""
+    process, pipe = fork(write, tmp_path / "run.h5")
+    assert pipe.recv() == "begun"
+    return process, pipe
 
 
 def writer_of(path, run):
@@ -61,7 +47,7 @@ def writer_of(path, run):
 
 def test_the_second_writer_is_refused_and_the_first_one_s_run_intact(tmp_path, other):
     path, run = tmp_path / "run.h5", trajectory()
-    first = other()
+    _, first = other
     attempts = [
         lambda: writer_of(path, run),
         lambda: save_trajectory(path, run, overwrite=True),
@@ -73,8 +59,8 @@ def test_the_second_writer_is_refused_and_the_first_one_s_run_intact(tmp_path, o
     assert len(load_trajectory(path)) == 3
     with h5py.File(path, "r", swmr=True) as file:  # what other programs do
         assert len(file["times"]) == 4
-    _, told = first.communicate("again\n")
-    assert first.returncode == 0, told
+    first.send(["late"])
+    assert first.recv() == "done"
     assert len(load_trajectory(path)) == len(run)
     assert [file.name for file in tmp_path.iterdir()] == ["run.h5"]
     writer_of(path, run).close()  # the lock has ended with the process
@@ -82,30 +68,29 @@ def test_the_second_writer_is_refused_and_the_first_one_s_run_intact(tmp_path, o
 
 
 def test_a_killed_writer_keeps_nobody(tmp_path, other):
-    process = other()
+    process, _ = other
     process.kill()
-    process.wait()
+    process.join()
     with TrajectoryWriter.resume(tmp_path / "run.h5") as writer:
         assert writer.steps == 3
 
 
-@pytest.mark.parametrize("word", ["", "again"])
-def test_a_writer_whose_file_was_replaced_or_moved_says_so(tmp_path, other, word):
+@pytest.mark.parametrize("late", [[], ["late"]])
+@pytest.mark.parametrize("replace", [True, False])
+def test_a_writer_whose_file_was_replaced_or_moved_says_so(tmp_path, other, replace, late):
     path, run = tmp_path / "run.h5", trajectory()
-    for replace in (True, False):
-        first = other()
-        if replace:
-            save_trajectory(tmp_path / "new.h5", run)
-            (tmp_path / "new.h5").replace(path)
-        else:
-            path.rename(tmp_path / "moved.h5")
-        _, told = first.communicate(word + "\n")
-        assert first.returncode == 1
-        assert "run.h5: has been replaced, moved or deleted by another program" in told
-        if replace:
-            assert_same(load_trajectory(path), run)
-        else:
-            assert not path.exists()
+    _, first = other
+    if replace:
+        save_trajectory(tmp_path / "new.h5", run)
+        (tmp_path / "new.h5").replace(path)
+    else:
+        path.rename(tmp_path / "moved.h5")
+    first.send(late)
+    assert "run.h5: has been replaced, moved or deleted by another program" in first.recv()
+    if replace:
+        assert_same(load_trajectory(path), run)
+    else:
+        assert not path.exists()
 
 
 def test_of_writers_that_start_at_once_one_writes(tmp_path):
@@ -132,21 +117,23 @@ def test_a_failed_writer_and_one_that_is_forgotten_keep_nobody(tmp_path):
 
 
 HOLDER = """
-    import fcntl, sys
-    file = open(sys.argv[1], "rb")
-    fcntl.flock(file, fcntl.LOCK_SH)
-    print("0\\n1\\n2", flush=True)
-    sys.stdin.readline()
+import fcntl, sys
+file = open(sys.argv[1], "rb")
+fcntl.flock(file, fcntl.LOCK_SH)
+print("held", flush=True)
+sys.stdin.readline()
 """
 
 
-def test_a_file_that_another_program_reads_is_written(tmp_path, other):
+def test_a_file_that_another_program_reads_is_written(tmp_path):
     """HDF5's own locks are not asked for."""
     path, run = tmp_path / "run.h5", trajectory()
-    writer = writer_of(path, run)
-    other(HOLDER)
-    writer.append_values(run.state(1), {})
-    writer.close()
+    writer, command = writer_of(path, run), [sys.executable, "-c", HOLDER, str(path)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as holder:
+        assert holder.stdout.readline() == b"held\n"
+        writer.append_values(run.state(1), {})
+        writer.close()
+        holder.communicate(b"\n")
     assert len(load_trajectory(path)) == 1
 
 
@@ -167,11 +154,12 @@ def test_lock_errors_of_hdf5_are_explained(tmp_path, monkeypatch, number, words)
 
 def test_the_program_is_refused_with_one_line(tmp_path, other, program):
     (tmp_path / "scene.toml").write_text(beam((2, 1, 1), time={"frames": 2}).to_toml())
-    first = other()
+    _, first = other
     command = "simulate", tmp_path / "scene.toml", "-o", tmp_path / "run.h5", "--overwrite"
     status, _, err = program(*command)
     assert status == 1
     assert "is being written by another program" in err
-    first.communicate("\n")
+    first.send([])
+    assert first.recv() == "done"
     assert program(*command)[0] == 0
     assert np.isfinite(load_trajectory(tmp_path / "run.h5").positions).all()

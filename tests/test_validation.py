@@ -34,6 +34,7 @@ COVERED = {
     "four_errors": "test_integrators, test_convergence_orders, test_metrics",
     "gallery": "test_examples, which runs its scenes by both solvers",
     "newton": "test_steppers, test_elements",
+    "obstacles": "test_obstacles",
     "stability": "test_stability_case, test_robustness",
     "stress": "test_robustness, test_recovery, test_thin_cells",
     "time_error": "test_integrators",

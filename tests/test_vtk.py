@@ -9,7 +9,7 @@ import pytest
 
 import pdcorrect as pc
 from conftest import beam
-from motion import cross_mesh, trajectory
+from motion import trajectory
 from pdcorrect.errors import InputError, MeshError, OutputError
 from pdcorrect.fem.mesh_files import read_hex_mesh, write_vtu
 from pdcorrect.io.vtk import delete_vtu_series, write_vtu_series
@@ -140,37 +140,6 @@ def test_a_failed_write_leaves_the_old_file(run, tmp_path, monkeypatch):
 
 
 # --- meshes from files -----------------------------------------------------------------
-
-
-def test_hexahedra_are_read_and_other_cells_and_unused_nodes_dropped(tmp_path, capfd):
-    mesh = cross_mesh()
-    points = np.concatenate([[[9.0, 9.0, 9.0]], mesh.positions, [[8.0, 8.0, 8.0]]])
-    cells = [
-        ("quad", mesh.cells[:2, :4] + 1),
-        ("hexahedron", mesh.cells[:5] + 1),
-        ("line", [[0, 1]]),
-        ("hexahedron", mesh.cells[5:] + 1),
-        ("vertex", [[0]]),
-    ]
-    path = tmp_path / "mesh.vtu"
-    meshio.write(path, meshio.Mesh(points, cells))
-    found = read_hex_mesh(path)
-    np.testing.assert_array_equal(found.positions, mesh.positions)
-    np.testing.assert_array_equal(found.cells, mesh.cells)
-
-    cube = np.array([[x, y, z] for z in (0, 1) for y in (0, 1) for x in (0, 1)], dtype=float)
-    hexahedron = ("hexahedron", [[0, 1, 3, 2, 4, 5, 7, 6]])
-    for name, cells, words in (
-        ("flat", [("quad", [[0, 1, 3, 2]])], "quad"),
-        ("mixed", [hexahedron, ("tetra", [[0, 1, 2, 4]])], "tetra"),
-        ("inverted", [("hexahedron", [[4, 5, 7, 6, 0, 1, 3, 2]])], "inverted"),
-    ):
-        path = tmp_path / f"{name}.vtu"
-        meshio.write(path, meshio.Mesh(cube, cells))
-        capfd.readouterr()
-        with pytest.raises(MeshError, match=words):
-            read_hex_mesh(path)
-        assert capfd.readouterr() == ("", "")
 
 
 @pytest.mark.parametrize("name", ["a.vtu", "a.msh", "a.inp", "a.xyz", "noname"])

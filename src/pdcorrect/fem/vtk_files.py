@@ -1,7 +1,4 @@
-"""VTK files: by meshio what it reads whole, by VTK through pyvista all others.
-
-``python -m pdcorrect.fem.vtk_files FILE TARGET`` is the process in which VTK reads.
-"""
+"""VTK files: by meshio what it reads whole, by VTK in a process of its own all others."""
 
 from __future__ import annotations
 
@@ -44,7 +41,7 @@ _BEYOND_MESHIO = re.compile(
 _GHOSTS, _GHOST = "vtkGhostType", 1 | 32
 """VTK's array of cells that another piece has too (1) or that are blanked (32)."""
 _VALUE = "value "
-"""Before the names of arrays of cells, which may be any."""
+"""Before the names of arrays of cells in `vtk_process`, which may be any."""
 
 
 def read_vtk(path: Path) -> Content:
@@ -53,7 +50,7 @@ def read_vtk(path: Path) -> Content:
     Raises
     ------
     MeshError
-        If the file is damaged, or needs pyvista, which is missing.
+        If the file is damaged, or needs VTK, which is missing.
     """
     head = _head(path)
     sources = re.findall(rb'<Piece\b[^>]*\bSource\s*=\s*"([^"\0]*)"', head)  # of a .pvtu
@@ -147,7 +144,7 @@ def value_groups(values: Mapping[str, NDArray[Any]]) -> dict[str, Integers]:
 
 def _by_vtk(path: Path, pieces: list[tuple[int, int]], reason: str) -> Content:
     """Read a file by VTK in another process, which some damaged files end."""
-    if importlib.util.find_spec("pyvista") is None:
+    if importlib.util.find_spec("vtkmodules") is None:
         raise MeshError(
             f"{path}: meshio cannot read it ({reason}). Install pyvista, which can (pip install "
             "'pdcorrect[view]'), or save it in ParaView as one unstructured grid of hexahedra "
@@ -155,7 +152,7 @@ def _by_vtk(path: Path, pieces: list[tuple[int, int]], reason: str) -> Content:
         )
     with tempfile.TemporaryDirectory() as folder:
         target = Path(folder) / "grid.npz"
-        command = [sys.executable, "-m", "pdcorrect.fem.vtk_files", str(path), str(target)]
+        command = [sys.executable, "-m", "pdcorrect.fem.vtk_process", str(path), str(target)]
         done = subprocess.run(command, capture_output=True, text=True, errors="replace")
         if done.returncode != 0:
             *_, last = ["it ended", *done.stderr.split("\n")[-2:-1]]
@@ -170,41 +167,6 @@ def _by_vtk(path: Path, pieces: list[tuple[int, int]], reason: str) -> Content:
             f"{wanted[0]} and {wanted[1]} that it says it has."
         )
     return _from_grid(path, grid, [points for points, _ in pieces])
-
-
-def _write_grid(path: str, target: str) -> None:
-    """Have VTK read a file, and write points, cells and whole numbers of cells as NumPy arrays."""
-    import pyvista
-    from vtkmodules.util.numpy_support import vtk_to_numpy
-    from vtkmodules.vtkCommonCore import vtkObject
-    from vtkmodules.vtkCommonDataModel import vtkGenericCell
-
-    vtkObject.SetGlobalWarningDisplay(0)  # damaged files make VTK print pages
-    reader = pyvista.get_reader(path)  # type: ignore[no-untyped-call]
-    grid = reader.read()
-    if not isinstance(grid, pyvista.UnstructuredGrid):
-        grid = grid.cast_to_unstructured_grid()
-    if reader.reader.GetErrorCode() or not grid.n_cells:
-        sys.exit(1)
-    names, dimensions, cell = [], [], vtkGenericCell()
-    for number in np.unique(grid.celltypes).tolist():
-        cell.SetCellType(number)
-        named = number in pyvista.CellType.__members__.values()
-        names.append(pyvista.CellType(number).name.lower() if named else f"VTK {number}")
-        dimensions.append(cell.GetCellDimension())
-    values = {name: np.asarray(own) for name, own in grid.cell_data.items()}
-    whole: dict[str, Any] = {
-        _VALUE + name: own for name, own in values.items() if own.dtype.kind in "iu"
-    }
-    table = grid.GetCells()
-    starts, nodes = (
-        vtk_to_numpy(part)  # type: ignore[no-untyped-call]
-        for part in (table.GetOffsetsArray(), table.GetConnectivityArray())
-    )
-    np.savez(
-        target, points=grid.points, types=grid.celltypes, starts=starts, nodes=nodes,
-        names=names, dimensions=dimensions, **whole,
-    )  # fmt: skip
 
 
 def _from_grid(path: Path, grid: Mapping[str, NDArray[Any]], pieces: list[int]) -> Content:
@@ -246,7 +208,3 @@ def _merged(points: NDArray[np.float64], pieces: list[int]) -> tuple[NDArray[np.
         return points, np.arange(len(points))
     merged, place = np.unique(points, axis=0, return_inverse=True)
     return merged, place.ravel()
-
-
-if __name__ == "__main__":
-    _write_grid(*sys.argv[1:])
