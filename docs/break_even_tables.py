@@ -66,7 +66,7 @@ def costs() -> Rows:
             f"{'≥ ' * lacks}{many(data)}, workers of an NVIDIA H200",
             f"{many(training)}, NVIDIA H200 or H100",
         ])  # fmt: skip
-    return ("trained once", "serves", "data, s", "training, s"), rows
+    return ("trained once", "serves", "data, s", "training asked for, s"), rows
 
 
 def break_even() -> Rows:
@@ -83,7 +83,7 @@ def break_even() -> Rows:
         *spent, _ = corrector_seconds(model)
         name, own = f"hybrid {model}", model.partition("-")[0]
         rows.append(_row(name, repaid(name, sum(spent), {own: points[own]}, measured)))
-    head = ("run, steps a frame", "scenes", "as near a rival: median", "least", "most", "never",
+    head = ("run, steps a frame", "scenes", "beside the front: median", "least", "most", "never",
             "hex27, as many steps, by time (as near)", "4×4×4, by time (as near)")  # fmt: skip
     return head, rows
 

@@ -170,10 +170,10 @@ def right_masses() -> Rows:
                      for r in runs[:3])  # fmt: skip
         corrected = record_of(f"{motion}-as-published")["runs"]["corrected"]["omega"]["mean"]
         rows.append([
-            f"{motion}, {count[motion]}", f"{thesis}, {percent(corrected)}",
+            f"{motion}, {count[motion]}", f"{thesis}", percent(corrected),
             *(f"{mean} ({worst})" for mean, worst in omegas), ", ".join(map(number, distances)),
         ])  # fmt: skip
-    head = ("motion, scenes", "thesis, corrector, as published", *runs,
+    head = ("motion, scenes", "thesis", "as published", *runs,
             "RMS, mm: learned, hex27, best coarse")  # fmt: skip
     return head, rows
 

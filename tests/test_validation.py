@@ -116,16 +116,6 @@ def test_a_cost_is_repaid_once_the_sums_are_equal_and_never_without_a_saving():
     assert math.isinf(simulations(0.0, own=4.0, rival=3.0))
 
 
-def test_the_rival_is_the_quickest_that_is_no_farther():
-    module = break_even()
-    rivals = [
-        module.Simulation(n, t, e) for n, t, e in (("far", 1, 5), ("slow", 9, 1), ("same", 2, 3))
-    ]
-    assert module.as_near(3.0, rivals).name == "same"  # a tie is as near
-    assert module.as_near(2.9, rivals).name == "slow"
-    assert module.as_near(0.5, rivals) is None
-
-
 def test_a_simulation_is_its_set_up_and_its_frames():
     module, point = break_even(), CASES["error_time"].module.Point
     reached = {
@@ -134,14 +124,19 @@ def test_a_simulation_is_its_set_up_and_its_frames():
     }  # fmt: skip
     set_up = {"learned": 0.5, "hex27": 0.1, "best on 4x4x4": 3.0}
     (found,) = module.repaid(
-        "learned, 2", 8.0, reached, {"frames": {"a": 40}, "set_up": {"a": set_up}}
+        "learned, 2", 7.9, reached, {"frames": {"a": 40}, "set_up": {"a": set_up}}
     )
-    assert (found.rival, found.equal) == ("hex27, 2", 10)  # 8 s / (2.1 s - 1.3 s)
+    assert found.equal == 10  # 7.9 s / (2.1 s - 1.3 s)
     assert found.fixed == (10, 1)
     assert found.near == (True, False)
+    reached["a"][0] = point("learned, 2", 20.0, 0.5)
+    (found,) = module.repaid(
+        "learned, 2", 7.9, reached, {"frames": {"a": 40}, "set_up": {"a": set_up}}
+    )
+    assert found.equal is None  # no rival is so near
     del reached["a"][1:]
     with pytest.raises(KeyError):
-        module.repaid("learned, 2", 8.0, reached, {"frames": {"a": 40}, "set_up": {"a": set_up}})
+        module.repaid("learned, 2", 7.9, reached, {"frames": {"a": 40}, "set_up": {"a": set_up}})
 
 
 def test_all_cases_are_imported_side_by_side():

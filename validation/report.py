@@ -26,7 +26,7 @@ from pdcorrect.errors import OutputError
 HERE = Path(__file__).parent
 FIGURES = (
     "error_time", "unlike_families", "easy_to_hard", "four_errors", "time_orders", "energy",
-    "stress", "cook", "locking", "turek_hron",
+    "stability", "cook", "locking", "turek_hron",
 )  # fmt: skip
 """Cases that are told with a figure, in the order of the page."""
 

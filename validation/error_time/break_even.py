@@ -5,7 +5,8 @@ python validation/error_time/break_even.py
 measures, on this machine, what no other record has, and writes
 ``validation/results/break_even.json``: the time of some of the learned element's bodies and of some
 iterations of its training, and the set-up of each method in each scene, as seconds of CPU on one
-thread.  `repaid` computes the rest from that and from the record of errors and times.
+thread.  `repaid` computes the rest from that and from the record of errors and times, whose frames
+are wall times on another machine.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from methods import METHODS, RIVALS, Point
+from methods import METHODS, RIVALS, Point, time_at
 
 HERE = Path(__file__).resolve().parent
 RECORD = HERE.parent / "results" / "break_even.json"
@@ -31,23 +32,15 @@ EPOCHS = 2
 NEVER = math.inf
 
 
-class Simulation(NamedTuple):
-    """Seconds, set-up included, and error of a method in a scene."""
-
-    name: str
-    seconds: float
-    error: float
-
-
 class Repaid(NamedTuple):
-    """Simulations that repay a cost in a scene, `NEVER`, or None where no rival is as near.
+    """Simulations that repay a cost in a scene beside the front of rivals, `NEVER`, or None where
+    no rival is as near.
 
     ``fixed`` are beside the rivals `fixed`, by time alone, and ``near`` whether the error is no
     larger than theirs.
     """
 
     scene: str
-    rival: str
     equal: float | None
     fixed: tuple[float, ...]
     near: tuple[bool, ...]
@@ -56,12 +49,6 @@ class Repaid(NamedTuple):
 def simulations(cost: float, own: float, rival: float) -> float:
     """Simulations after which ``cost`` s and ``own`` s each are no more than ``rival`` s each."""
     return math.ceil(cost / (rival - own)) if rival > own else NEVER
-
-
-def as_near(error: float, rivals: Sequence[Simulation]) -> Simulation | None:
-    """The quickest rival whose error is no larger; None if there is none."""
-    near = [rival for rival in rivals if rival.error <= error]
-    return min(near, key=lambda rival: rival.seconds) if near else None
 
 
 def stem(name: str) -> str:
@@ -75,11 +62,9 @@ def fixed(name: str) -> tuple[str, str]:
     return quadratic if quadratic in METHODS else "hex27, 1", "best on 4x4x4, 1"
 
 
-def whole(points: Sequence[Point], frames: int, set_up: dict[str, float]) -> list[Simulation]:
-    """Simulations of so many frames; set-ups, s, by `stem`."""
-    return [
-        Simulation(p.name, set_up[stem(p.name)] + 1e-3 * frames * p.time, p.error) for p in points
-    ]
+def whole(points: Sequence[Point], frames: int, set_up: dict[str, float]) -> list[Point]:
+    """Points of simulations, with s of so many frames and of set-ups, by `stem`, as times."""
+    return [Point(p.name, set_up[stem(p.name)] + 1e-3 * frames * p.time, p.error) for p in points]
 
 
 def repaid(
@@ -91,12 +76,12 @@ def repaid(
         every = whole(reached, measured["frames"][scene], measured["set_up"][scene])
         of = {simulation.name: simulation for simulation in every}
         own = of[name]
-        rival = as_near(own.error, [s for s in every if s.name in RIVALS])
-        equal = None if rival is None else simulations(cost, own.seconds, rival.seconds)
+        rival = time_at(own.error, [s for s in every if s.name in RIVALS])
+        equal = None if math.isnan(rival) else simulations(cost, own.time, rival)
         others = [of[other] for other in fixed(name)]
-        by_time = tuple(simulations(cost, own.seconds, other.seconds) for other in others)
+        by_time = tuple(simulations(cost, own.time, other.time) for other in others)
         near = tuple(own.error <= other.error for other in others)
-        out.append(Repaid(scene, "" if rival is None else rival.name, equal, by_time, near))
+        out.append(Repaid(scene, equal, by_time, near))
     return out
 
 

@@ -144,10 +144,9 @@ def finding(record: common.Record) -> str:
     return (
         f"Mean errors on twelve bodies that nothing was trained on: learned {told('learned, 1')}, "
         f"best coarse {told('best coarse, 1')}, hex27 {told('hex27, 1')}, 4×4×4 cells "
-        f"{told('best on 4x4x4, 1')}, a corrector of steps {told('hybrid torsion-exact')}. Beside "
-        f"the front of all runs without training, learned with two steps a frame is "
-        f"{quicker[0]:.1f} times as quick at its error (worst {quicker[1]:.2g}), and "
-        f"{nearer[0]:.1f} times as near in its time (worst {nearer[1]:.2g}): medians of "
+        f"{told('best on 4x4x4, 1')}; with two steps learned is {quicker[0]:.1f} times as quick at "
+        f"its error as the front of all untrained runs (worst {quicker[1]:.2g}), and "
+        f"{nearer[0]:.1f} times as near in its time (worst {nearer[1]:.2g}), in the median of "
         f"{len(points_of(record))} scenes."
     )
 

@@ -71,3 +71,29 @@ def finding(record: common.Record) -> str:
         f"steps the energy is at most {most:.3f} times the start's; its mean changes by "
         f"{min(drifts):.1f} to {max(drifts):.1f} % of that over the last nine tenths."
     )
+
+
+def draw(record: common.Record, path: Path) -> None:
+    """Runs that pass, are explained or fail, and the energy left after long runs."""
+    figure, (runs, energy) = common.panels(12, 3.6, 2)
+    rows = record.table(COUNTS)["rows"]
+    labels = [f"{element}, {integrator}" for element, integrator, *_ in rows]
+    start = np.zeros(len(rows))
+    for k, (word, colour) in enumerate(zip(battery.OUTCOMES, common.COLOURS, strict=False)):
+        counts = np.array([float(row[2 + k]) for row in rows])
+        runs.barh(labels, counts, left=start, color=colour, label=word)
+        start += counts
+    runs.invert_yaxis()
+    runs.set_xlabel("runs")
+    long = record.table(long_runs.TABLE)["rows"]
+    names = [", ".join(row[:3]) for row in long]
+    for k, (column, label) in enumerate(((4, "largest"), (5, "after a tenth"), (6, "last"))):
+        energy.plot([row[column] for row in long], names, common.MARKS[k][0],
+                    color=common.COLOURS[k], label=label)  # fmt: skip
+    energy.invert_yaxis()
+    energy.set_xlabel("energy over the start's")
+    for axis in (runs, energy):
+        common.plain(axis, "x")
+        axis.tick_params(labelsize=8)
+        axis.legend(fontsize=8)
+    common.save(figure, path)

@@ -261,27 +261,6 @@ def parts(quick: bool) -> dict[str, Callable[[], common.Outcome]]:
     return {s.name: partial(part, s) for s in BATTERY if s.quick or not quick}
 
 
-def draw(record: common.Record, path: Path) -> None:
-    """A cell a scene and solver: pass, slow, fail, or nothing expected."""
-    from matplotlib.colors import ListedColormap
-
-    words = ("pass", "slow", "fail")
-    figure, panels = common.panels(10, 7.4, 2)
-    for axis, name, first in zip(panels, (MATRIX, KNOWN), (SOLVERS, KNOWN_SOLVERS), strict=True):
-        rows = record.table(name)["rows"]
-        found = [[cell.split()[0] for cell in row[3:]] for row in rows]
-        shade = [[words.index(w) if w in words else 3 for w in row] for row in found]
-        colours = ListedColormap(["#bfe3cf", "#fbe7a9", "#eda89b", "#ffffff"])
-        axis.imshow(shade, colours, vmin=0, vmax=3, aspect="auto")
-        axis.set_xticks(range(len(first)), first, rotation=30, ha="left", fontsize=8)
-        axis.set_yticks(range(len(rows)), [row[0] for row in rows], fontsize=8)
-        axis.tick_params(top=True, labeltop=True, bottom=False, labelbottom=False, length=0)
-        for i, row in enumerate(found):
-            for k, word in enumerate(row):
-                axis.text(k, i, word, ha="center", va="center", fontsize=6.5)
-    common.save(figure, path)
-
-
 def finding(record: common.Record) -> str:
     """How many runs pass."""
     cells = [cell for n in (MATRIX, KNOWN) for row in record.table(n)["rows"] for cell in row[3:]]
