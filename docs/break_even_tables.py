@@ -83,14 +83,14 @@ def break_even() -> Rows:
         *spent, _ = corrector_seconds(model)
         name, own = f"hybrid {model}", model.partition("-")[0]
         rows.append(_row(name, repaid(name, sum(spent), {own: points[own]}, measured)))
-    head = ("run, steps a frame", "scenes", "beside the front: median", "least", "most", "never",
+    head = ("run, steps a frame", "scenes", "beside the front: median", "least", "never",
             "hex27, as many steps, by time (as near)", "4×4×4, by time (as near)")  # fmt: skip
     return head, rows
 
 
 def _row(name: str, found: list[Repaid]) -> list[str]:
     equal = [each.equal for each in found if each.equal is not None]
-    ends = [many(median(equal)), many(min(equal)), many(max(equal))] if equal else ["–"] * 3
+    ends = [many(median(equal)), many(min(equal))] if equal else ["–"] * 2
     beside = [
         f"{many(median(each.fixed[k] for each in found))} ({sum(each.near[k] for each in found)})"
         for k in range(2)

@@ -10,6 +10,7 @@ import pdcorrect as pc
 from conftest import CLAMPED, beam
 from pdcorrect.cli.program import app
 from pdcorrect.errors import ConvergenceError, PdcorrectWarning, SceneError
+from pdcorrect.evaluation.run_report import lost_energy
 from pdcorrect.fem.clamps import Clamps, check_held
 
 QUASI_STATIC = {"step": 0.1, "frames": 1, "integrator": "quasi-static"}
@@ -28,6 +29,7 @@ def plausible(**changes):
         ({"material": {"density": 1e-3}, "time": {"step": 1e-5}}, "0.001 kg"),
         ({"material": {"young": 0.1}, "time": {"step": 1e-4}}, "steps"),
         ({"material": {"young": 2e11}, "time": {"step": 1.0}}, "steps"),
+        ({"material": {"young": 50.0}}, "50 Pa"),
     ],
 )
 def test_magnitudes_of_other_units_get_one_line(changes, named):
@@ -50,6 +52,21 @@ def test_usual_magnitudes_get_none(changes):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         pc.discretise(plausible(**changes))
+
+
+@pytest.mark.parametrize(("step", "told"), [(2e-3, True), (1e-6, False)])
+def test_what_the_time_steps_lose_is_the_dissipation_of_the_balance(step, told):
+    scene = plausible(
+        clamps=[], loads=[], time={"step": step, "integrator": "backward-euler"},
+        initial={"velocity_gradient": [[20.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]]},
+    )  # fmt: skip
+    problem = pc.discretise(scene)
+    run = pc.rollout(pc.ProjectiveDynamics(problem), 2)
+    balance = pc.metrics.energy_balance(run)
+    lost, text = balance.dissipation[-1], lost_energy(problem, run.stats)
+    assert (lost > 0.2 * balance.total[0]) is told
+    assert bool(text) is told
+    assert not told or f"{lost:.4g} J" in text
 
 
 X, Y, Z = ({"region": {"plane": axis, "at": "min"}, "components": [axis]} for axis in "xyz")

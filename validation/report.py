@@ -103,9 +103,10 @@ def conditions(sections: Sequence[Section]) -> str:
     """How much was judged."""
     words = [row[-1] for each in sections for row in harness.judged(each.case, each.record)]
     return (
-        f"{len(words)} figures of {len(sections)} cases were judged by what was written down "
-        f"before: {words.count('known failure')} are known to fail, {words.count('outside')} are "
-        "outside. Seeds are in the cases' scripts."
+        f"{len(sections)} cases have {len(words)} figures with expectations: "
+        f"{words.count('ok')} hold, {words.count('known failure')} are known failures, kept with "
+        f"their reasons, {words.count('outside')} came out other than expected. Seeds are in the "
+        "cases' scripts."
     )
 
 

@@ -60,14 +60,14 @@ _WORDS = {
     "dict_type": "expected a table of keys",
     "float_type": "expected a number",
     "int_type": "expected an integer",
-    "list_type": "expected a list",
+    "list_type": "expected a list (a table of it begins with [[, as in [[loads]])",
     "model_attributes_type": "expected a table of keys",
     "model_type": "expected a table of keys",
     "path_type": "expected a path",
     "string_type": "expected a string",
     "too_long": "expected a list of at most {max_length}, got {actual_length}",
     "too_short": "expected a list of at least {min_length}, got {actual_length}",
-    "tuple_type": "expected a list",
+    "tuple_type": "expected a list (a table of it begins with [[, as in [[loads]])",
     "union_tag_invalid": "expected one of {expected_tags}",
 }
 """By the type of pydantic's error, where its own words would tell of Python."""

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from pdcorrect.errors import InputError
 from pdcorrect.fem.probes import probe_weights
 from pdcorrect.solvers.rollout import restrict
+from pdcorrect.state import State
 from pdcorrect.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -228,15 +229,19 @@ _ENERGIES = ("kinetic_energy", "elastic_energy", "external_work", "clamp_work", 
 """Statistics of a step: energies after it, then work and loss in it."""
 
 
+def energies(problem: Problem, state: State) -> tuple[float, float]:
+    """Kinetic and elastic energy of a state, J; rollers and actuators count as elastic."""
+    kinetic = 0.5 * float(np.vdot(state.velocities, problem.mass_times(state.velocities)))
+    u = state.positions - problem.positions
+    attached = sum(one.energy_and_forces(u, state.time)[0] for one in problem.attached)
+    return kinetic, problem.energy(state.positions) + attached
+
+
 def _initial_energies(run: Trajectory, problem: Problem | None) -> tuple[float, float]:
     """Kinetic and elastic energy of frame 0, J."""
     positions, velocities = run.positions[0], run.velocities[0]
     if problem is not None:
-        kinetic = 0.5 * float(np.vdot(velocities, problem.mass_times(velocities)))
-        elastic = problem.energy(positions)
-        for one in problem.attached:
-            elastic += one.energy_and_forces(positions - problem.positions, run.times[0])[0]
-        return kinetic, elastic
+        return energies(problem, State(positions, velocities, float(run.times[0])))
     moves = velocities.any() or (positions != run.points).any()
     if moves or "actuator_work" in run.stats:
         raise InputError(

@@ -120,10 +120,10 @@ def _check_outputs(
 
     for folder in filter(None, (vtu, report)):
         make_folder(folder)
-    beside = [probes_file(output)] if scene.probes else []
+    beside = [] if resume else [output]
+    beside += [probes_file(output)] if scene.probes else []
     beside += [vtu / f"{output.stem}.pvd"] if vtu else []
     beside += [report / PAGE] if report else []
-    beside += [] if resume else [output]
     check_new(*beside, overwrite=overwrite or resume)
 
 

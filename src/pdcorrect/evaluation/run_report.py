@@ -17,8 +17,9 @@ from pdcorrect.evaluation.report import (
     refused_corrections,
     three_digits,
 )
-from pdcorrect.metrics import largest_displacement
-from pdcorrect.solvers.rollout import gained_energy, inverted_frames
+from pdcorrect.fem.problem import Problem
+from pdcorrect.metrics import energies, largest_displacement
+from pdcorrect.solvers.rollout import gained_energy, inverted_frames, stored_and_put_in
 from pdcorrect.trajectory import Stepper, Trajectory
 
 _WORK = {
@@ -29,6 +30,8 @@ _WORK = {
     "friction_loss": "lost to friction",
 }
 """Told of where there is any."""
+_LOST = 0.2
+"""Share of the energy of whose loss by the integrator is told."""
 
 
 def summary(stats: Mapping[str, Any], stepper: Stepper, resumed: int = 0) -> list[str]:
@@ -53,13 +56,26 @@ def summary(stats: Mapping[str, Any], stepper: Stepper, resumed: int = 0) -> lis
         + ", ".join(f"{text} {stats[name].sum():.4g} J" for name, text in work.items()),
     ]
     if problem.scene.time.integrator != "quasi-static":
-        found.append(gained_energy(stats))
+        found += [gained_energy(stats), lost_energy(problem, stats)]
     if "gate" in stats:
         if not stats["refused"].all():
             largest = 1e3 * stats["correction"].max()
             found.append(f"corrections: at most {largest:.3g} mm of a node in a frame")
         found.append(refused_corrections(stats["gate"]))
     return [*filter(None, [*found, inverted_frames(stats, problem.scene.time.step)])]
+
+
+def lost_energy(problem: Problem, stats: Mapping[str, Any]) -> str:
+    """What the integrator lost of the energy that a run had or was given; empty if little."""
+    stored, put_in = stored_and_put_in(stats)
+    start = sum(energies(problem, problem.initial_state()))
+    lost, most = start + put_in[-1] - stored[-1], start + max(float(put_in.max()), 0.0)
+    if not lost > _LOST * most > 0.0:
+        return ""
+    return (
+        f"the time steps lost {lost:.4g} J, {lost / most:.0%} of the energy that there was: "
+        "take smaller ones, substeps or another integrator if motion matters"
+    )
 
 
 def write_run_report(

@@ -15,6 +15,8 @@ _LENGTHS = 1e-4, 100.0
 """Of a body, m."""
 _STEPS = 1e-4, 1e4
 """In which a pressure wave crosses a body."""
+_GRAVITY = 9.81
+"""m/s2."""
 _DENSITY = 1.0
 """Least, kg/m3; aerogels are lighter."""
 
@@ -38,10 +40,13 @@ def _implausible(scene: Scene, body: ElasticBody) -> Iterator[str]:
     density = float(body.materials.density.min())
     if density < _DENSITY:
         yield f"the density is {density:.3g} kg/m3"
+    young, heaviest = float(body.materials.young.max()), float(body.materials.density.max())
+    if young < _GRAVITY * heaviest * length:
+        yield f"its Young's modulus, {young:.3g} Pa, is below the pressure under its own height"
     if scene.time.integrator == "quasi-static":
         return
-    young, poisson = body.materials.young, body.materials.poisson
-    modulus = young * (1.0 - poisson) / ((1.0 + poisson) * (1.0 - 2.0 * poisson))
+    poisson = body.materials.poisson
+    modulus = body.materials.young * (1.0 - poisson) / ((1.0 + poisson) * (1.0 - 2.0 * poisson))
     speed = float(np.sqrt(modulus / body.materials.density).max())
     steps = length / (speed * scene.time.step / scene.time.substeps)
     if not _STEPS[0] <= steps <= _STEPS[1]:

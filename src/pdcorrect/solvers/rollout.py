@@ -172,8 +172,8 @@ def rollout(
     return run
 
 
-def gained_energy(stats: Mapping[str, Any]) -> str:
-    """Whether a run has more energy than was put in since its first step; empty if not."""
+def stored_and_put_in(stats: Mapping[str, Any]) -> tuple[Array, Array]:
+    """Energy after each frame of a run, and what went in since the start less losses, (T,), J."""
     stored = np.asarray(stats["elastic_energy"]) + np.asarray(stats["kinetic_energy"])
     put_in = np.asarray(stats["external_work"]) + stats["clamp_work"] - stats["damping_loss"]
     if "contact_energy" in stats:
@@ -181,7 +181,12 @@ def gained_energy(stats: Mapping[str, Any]) -> str:
         put_in = put_in + stats["obstacle_work"] - stats["friction_loss"]
     if "actuator_work" in stats:
         put_in = put_in + stats["actuator_work"]
-    put_in = np.cumsum(put_in)
+    return stored, np.cumsum(put_in)
+
+
+def gained_energy(stats: Mapping[str, Any]) -> str:
+    """Whether a run has more energy than was put in since its first step; empty if not."""
+    stored, put_in = stored_and_put_in(stats)
     gained = float(((stored - stored[0]) - (put_in - put_in[0])).max())
     if not gained > _GAINED * stored.max():
         return ""
