@@ -377,8 +377,9 @@ def test_a_run_does_not_depend_on_the_number_of_threads():
         "assert cell_loops._in_threads.signatures\n"
         "sys.stdout.buffer.write(run.positions.tobytes())"
     )
-    environment = {**os.environ, "NUMBA_NUM_THREADS": "2", "OMP_NUM_THREADS": "2"}
-    environment.pop("PYTEST_XDIST_WORKER", None)  # with it conftest asks for one thread
+    environment = {**os.environ, "NUMBA_NUM_THREADS": "2"}
+    for one_thread in ("PYTEST_XDIST_WORKER", "OMP_THREAD_LIMIT"):  # by conftest, by OpenMP
+        environment.pop(one_thread, None)
     two = subprocess.run(
         [sys.executable, "-c", code, str(Path(__file__).parent)],
         env=environment, stdout=subprocess.PIPE, check=True,
