@@ -36,6 +36,17 @@ CLAMPED = [{"region": {"plane": "x", "at": 0.0}}]
 GRAVITY = [{"kind": "gravity", "acceleration": [0.0, 0.0, -9.81]}]
 
 
+def slow_unless(fast, values):
+    """Parameters (tuples are several), marked slow unless they are among the fast ones."""
+    return [
+        pytest.param(
+            *(value if isinstance(value, tuple) else (value,)),
+            marks=[] if value in fast else [pytest.mark.slow],
+        )
+        for value in values
+    ]
+
+
 def pytest_collection_modifyitems(items):
     items.sort(key=lambda item: item.path.stem not in LONG)
 
@@ -153,28 +164,52 @@ def program(capsys, monkeypatch):
     return call
 
 
+LIMIT = 60.0
+"""Seconds that a test waits for a copy of its process."""
+
+
+class Copy:
+    """A copy of this process that calls a function, and a pipe to it; waits `LIMIT` at most."""
+
+    def __init__(self, function, *arguments):
+        context = multiprocessing.get_context("fork")
+        self._pipe, there = context.Pipe()
+        self._process = context.Process(target=function, args=(there, *arguments), daemon=True)
+        self._process.start()
+        there.close()
+        self.name = function.__name__
+        self.send, self.kill = self._pipe.send, self._process.kill
+
+    def recv(self):
+        if not self._pipe.poll(LIMIT):
+            pytest.fail(f"{self.name} has sent nothing in {LIMIT} s")
+        return self._pipe.recv()
+
+    def join(self):
+        """Its exit code."""
+        self._process.join(LIMIT)
+        assert self._process.exitcode is not None, f"{self.name} has not ended in {LIMIT} s"
+        return self._process.exitcode
+
+
 @pytest.fixture
 def fork():
     """Call a function in a copy of this process, which imports nothing again.
 
-    Its first argument is a pipe; the other end of it comes back with the process.
+    Its first argument is a pipe; the other end of it is in the `Copy` that comes back.
     """
     if sys.platform != "linux":
         pytest.skip("no safe copies of a process with libraries there")
-    context, started = multiprocessing.get_context("fork"), []
+    started = []
 
     def start(function, *arguments):
-        here, there = context.Pipe()
-        process = context.Process(target=function, args=(there, *arguments), daemon=True)
-        process.start()
-        there.close()
-        started.append(process)
-        return process, here
+        started.append(Copy(function, *arguments))
+        return started[-1]
 
     yield start
-    for process in started:
-        process.kill()
-        process.join()
+    for copy in started:
+        copy.kill()
+        copy.join()
 
 
 @pytest.fixture

@@ -220,9 +220,7 @@ def test_the_cache_lies_where_the_environment_says(monkeypatch, tmp_path):
 
 def test_two_writers_leave_one_whole_entry(scene, computed, cache, fork):
     writers = [fork(lambda _: pc.converged(scene)) for _ in range(2)]
-    for process, _ in writers:
-        process.join()
-        assert process.exitcode == 0
+    assert [writer.join() for writer in writers] == [0, 0]
     assert [path.suffix for path in cache.iterdir()] == [".h5"]
     pc.converged(scene)
     assert computed == []

@@ -210,9 +210,7 @@ def save_and_die(_, model):
 
 
 def test_a_kill_between_the_two_files_is_told(model, fork):
-    process, _ = fork(save_and_die, model)
-    process.join()
-    assert process.exitcode == 9
+    assert fork(save_and_die, model).join() == 9
     with pytest.raises(FileFormatError, match=rf"{WEIGHTS}: its checksum"):
         load_model(model)
     saved(model, seed=1)

@@ -61,6 +61,22 @@ def test_free_flight_keeps_momentum_and_moves_as_told(integrator):
     np.testing.assert_allclose(run.positions, expected, atol=1e-9)
 
 
+def angular_drift(scene, frames):
+    problem = pc.discretise(scene)
+    run = pc.rollout(pc.Newton(problem, tolerance=1e-11), frames)
+    assert problem.mass_is_diagonal
+    angular = pc.metrics.angular_momentum(run.positions, run.velocities, problem.mass)
+    return pc.metrics.relative_drift(angular)
+
+
+def test_angular_momentum_errs_less_with_smaller_steps():
+    drifts = []
+    for halvings in (1, 2):
+        time = {"step": 2e-3 / halvings, "integrator": "generalised-alpha"}
+        drifts.append(angular_drift(free(time=time), 6 * halvings))
+    assert drifts[1] < 0.35 * drifts[0] < 1e-3
+
+
 def test_clamps_win_and_it_is_told():
     scene = beam(initial={"velocity": [0.0, 1.0, 0.0]}, loads=[])
     problem = pc.discretise(scene)

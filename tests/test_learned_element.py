@@ -7,7 +7,7 @@ import pytest
 import torch
 
 import pdcorrect as pc
-from conftest import beam, cross, problem_on
+from conftest import beam, cross, problem_on, slow_unless
 from pdcorrect.elements.answers import VoxelMesh, unit_cell
 from pdcorrect.elements.linear import unit_strains
 from pdcorrect.errors import PdcorrectWarning, SceneError
@@ -536,7 +536,7 @@ def test_batches_equal_single_steps(damping):
         assert state.positions[i, : len(single)].numpy() == pytest.approx(single, abs=1e-10)
 
 
-@pytest.mark.parametrize("damping", DAMPINGS[:2], ids=str)
+@pytest.mark.parametrize("damping", slow_unless(DAMPINGS[:2], DAMPINGS), ids=str)
 def test_derivatives_of_batches_equal_those_of_single_steps(damping):
     problems, batch = batch_of_two(damping)
     before = batch(batch.rest_state()).state

@@ -654,3 +654,24 @@ def test_damaged_pieces_are_refused(tmp_path, old, new):
     assert old in text
     with pytest.raises(MeshError, match="a.vtu"):
         read(tmp_path, "a.vtu", text.replace(old, new, 1))
+
+
+# --- any damage ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("suffix", ["msh", "inp"])
+def test_any_damage_is_a_mesh_error(tmp_path, suffix):
+    rng = np.random.default_rng(1)
+    good = {"msh": GOOD_41, "inp": PART + "*INSTANCE, NAME=I, PART=P\n0,1,2\n1,2,3,4,5,6,7\n"}[
+        suffix
+    ]
+    for _ in range(150):
+        data = bytearray(good.encode())
+        start, end = np.sort(rng.integers(len(data), size=2))
+        data[start : min(end, start + 9)] = rng.choice(list(b"0123456789-.,*$\n e="), 3).tolist()
+        try:
+            mesh = read(tmp_path, f"a.{suffix}", bytes(data))
+        except MeshError as error:
+            assert f"a.{suffix}" in str(error)
+        else:
+            assert np.isfinite(mesh.positions).all()

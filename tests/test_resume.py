@@ -601,15 +601,13 @@ def test_a_run_on_a_full_disk_goes_on_when_there_is_room(program, fork, scene_fi
     simulate = ("simulate", scene_file, "--frames", 150, "-o")
     program(*simulate, expected)
     limit = expected.stat().st_size * 2 // 3
-    _, pipe = fork(run_with_limit, limit, *simulate, path)
-    status, message = pipe.recv()
+    status, message = fork(run_with_limit, limit, *simulate, path).recv()
     assert status == FAILED
     assert "File too large" in message
     held = load_trajectory(path)
     assert 10 < len(held) < 150
     kept = path.read_bytes()
-    _, pipe = fork(run_with_limit, limit // 4, *simulate, path, "--resume")
-    status, message = pipe.recv()
+    status, message = fork(run_with_limit, limit // 4, *simulate, path, "--resume").recv()
     assert status == FAILED
     assert "run.h5" in message
     assert path.read_bytes() == kept

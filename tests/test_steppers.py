@@ -370,18 +370,26 @@ def test_a_run_does_not_depend_on_the_number_of_threads():
     code = (
         "import sys; sys.path.insert(0, sys.argv[1])\n"
         "from conftest import cross\n"
-        "import pdcorrect as pc\n"
+        "import numba, pdcorrect as pc\n"
+        "from pdcorrect.fem import cell_loops\n"
         "run = pc.rollout(pc.ProjectiveDynamics(pc.discretise(cross(), refine=2)), 2)\n"
+        "assert numba.get_num_threads() == 2\n"
+        "assert cell_loops._in_threads.signatures\n"
         "sys.stdout.buffer.write(run.positions.tobytes())"
     )
+    environment = {**os.environ, "NUMBA_NUM_THREADS": "2"}
+    for one_thread in ("PYTEST_XDIST_WORKER", "OMP_THREAD_LIMIT"):  # by conftest, by OpenMP
+        environment.pop(one_thread, None)
     two = subprocess.run(
         [sys.executable, "-c", code, str(Path(__file__).parent)],
-        env={**os.environ, "NUMBA_NUM_THREADS": "2"}, capture_output=True, check=True,
+        env=environment, stdout=subprocess.PIPE, check=True,
     ).stdout  # fmt: skip
     before = numba.get_num_threads()
     numba.set_num_threads(1)
-    one = pc.rollout(pc.ProjectiveDynamics(pc.discretise(cross(), refine=2)), 2)
-    numba.set_num_threads(before)
+    try:
+        one = pc.rollout(pc.ProjectiveDynamics(pc.discretise(cross(), refine=2)), 2)
+    finally:
+        numba.set_num_threads(before)
     assert one.positions.tobytes() == two
 
 

@@ -1,6 +1,7 @@
 """Gradients of batches, and the layer."""
 
 import gc
+import pickle
 import weakref
 
 import numpy as np
@@ -205,6 +206,19 @@ def test_one_scene_needs_no_batch_dimension():
     assert after.shape == speed.shape == start.shape
     after.sum().backward()
     assert start.grad.shape == start.shape
+
+
+def test_materials_given_are_the_materials_used():
+    problem = pc.discretise(beam((3, 1, 1)))
+    stepper = pc.BatchStepper([problem], 1e-10)
+    layer = pc.PDLayer(stepper)
+    rest = stepper.rest_state()
+    values = {"young": 3e5, "poisson": 0.2, "density": 1500.0}
+    given = {name: torch.tensor([[value]], dtype=torch.float64) for name, value in values.items()}
+    after, _ = layer(rest.positions, rest.velocities, **given)
+    other = pc.ProjectiveDynamics(problem.with_material(**values), 1e-10)
+    exact = other(problem.rest_state()).state.positions
+    np.testing.assert_allclose(after[0].numpy(), exact, atol=1e-10)
 
 
 def test_a_call_does_not_see_the_material_of_another():
@@ -557,3 +571,25 @@ def test_nodes_that_a_scene_does_not_have_get_no_gradient():
     for x in (p, v, f):
         assert not x.grad[absent].any()
         assert x.grad[~absent].any()
+
+
+def test_steps_in_inference_mode_come_out_the_same():
+    stepper = small_batch()
+    p, v, f = inputs(stepper)
+    layer = pc.PDLayer(stepper, 2)
+    with torch.inference_mode():
+        first, _ = layer(p, v, f)
+    after, _ = layer(p, v, f)
+    after.sum().backward()
+    assert torch.equal(first, after)
+    assert p.grad.any()
+
+
+def test_a_layer_with_follower_loads_can_be_copied():
+    twist = [{"kind": "torsion", "strength": 100.0, "stretch": 0.2, "follower": True}]
+    stepper = pc.BatchStepper([pc.discretise(beam((2, 1, 1), loads=twist))], 1e-9)
+    layer = pc.PDLayer(stepper)
+    rest = stepper.rest_state()
+    expected, _ = layer(rest.positions, rest.velocities)
+    after, _ = pickle.loads(pickle.dumps(layer))(rest.positions, rest.velocities)
+    assert torch.equal(after, expected)

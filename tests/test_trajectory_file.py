@@ -228,17 +228,17 @@ def write_on(pipe, path, ready):
 @pytest.mark.parametrize("ready", [1, 2, 17, 40])
 def test_a_killed_writer_leaves_every_complete_frame(run, tmp_path, fork, ready):
     path = tmp_path / "run.h5"
-    process, pipe = fork(write_on, path, ready)
+    writer = fork(write_on, path, ready)
     try:
-        assert pipe.recv() == "ready"
+        assert writer.recv() == "ready"
         if ready > 1:
             assert len(load_trajectory(path)) >= ready - 1  # also while it is being written
             if ready != 17:  # it adds statistics soon after, and opens the file again
                 with h5py.File(path, "r", swmr=True) as file:  # what other programs do
                     assert len(file["times"]) >= ready - 1
     finally:
-        process.kill()
-        process.join()
+        writer.kill()
+        writer.join()
     loaded = load_trajectory(path)
     assert len(loaded) >= ready - 1
     for k in range(1, len(loaded.times)):
@@ -312,10 +312,9 @@ def write_with_limit(pipe, path, limit, reserved):
 )
 def test_a_full_disk_is_reported_and_keeps_the_frames_before(tmp_path, fork, limit, reserved):
     path = tmp_path / "run.h5"
-    process, pipe = fork(write_with_limit, path, limit, reserved)
-    message = pipe.recv()
-    process.join()
-    assert process.exitcode == 0
+    writer = fork(write_with_limit, path, limit, reserved)
+    message = writer.recv()
+    assert writer.join() == 0
     assert re.search(r"run\.h5: cannot be written", message), message
     if limit < 20_000:
         assert not path.exists()

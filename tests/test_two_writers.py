@@ -35,10 +35,10 @@ def write(pipe, path):
 
 @pytest.fixture
 def other(fork, tmp_path):
-    """A process that has written three frames, and a pipe to it."""
-    process, pipe = fork(write, tmp_path / "run.h5")
-    assert pipe.recv() == "begun"
-    return process, pipe
+    """A process that has written three frames."""
+    writer = fork(write, tmp_path / "run.h5")
+    assert writer.recv() == "begun"
+    return writer
 
 
 def writer_of(path, run):
@@ -47,7 +47,6 @@ def writer_of(path, run):
 
 def test_the_second_writer_is_refused_and_the_first_one_s_run_intact(tmp_path, other):
     path, run = tmp_path / "run.h5", trajectory()
-    _, first = other
     attempts = [
         lambda: writer_of(path, run),
         lambda: save_trajectory(path, run, overwrite=True),
@@ -59,8 +58,8 @@ def test_the_second_writer_is_refused_and_the_first_one_s_run_intact(tmp_path, o
     assert len(load_trajectory(path)) == 3
     with h5py.File(path, "r", swmr=True) as file:  # what other programs do
         assert len(file["times"]) == 4
-    first.send(["late"])
-    assert first.recv() == "done"
+    other.send(["late"])
+    assert other.recv() == "done"
     assert len(load_trajectory(path)) == len(run)
     assert [file.name for file in tmp_path.iterdir()] == ["run.h5"]
     writer_of(path, run).close()  # the lock has ended with the process
@@ -68,9 +67,8 @@ def test_the_second_writer_is_refused_and_the_first_one_s_run_intact(tmp_path, o
 
 
 def test_a_killed_writer_keeps_nobody(tmp_path, other):
-    process, _ = other
-    process.kill()
-    process.join()
+    other.kill()
+    other.join()
     with TrajectoryWriter.resume(tmp_path / "run.h5") as writer:
         assert writer.steps == 3
 
@@ -79,14 +77,13 @@ def test_a_killed_writer_keeps_nobody(tmp_path, other):
 @pytest.mark.parametrize("replace", [True, False])
 def test_a_writer_whose_file_was_replaced_or_moved_says_so(tmp_path, other, replace, late):
     path, run = tmp_path / "run.h5", trajectory()
-    _, first = other
     if replace:
         save_trajectory(tmp_path / "new.h5", run)
         (tmp_path / "new.h5").replace(path)
     else:
         path.rename(tmp_path / "moved.h5")
-    first.send(late)
-    assert "run.h5: has been replaced, moved or deleted by another program" in first.recv()
+    other.send(late)
+    assert "run.h5: has been replaced, moved or deleted by another program" in other.recv()
     if replace:
         assert_same(load_trajectory(path), run)
     else:
@@ -154,12 +151,11 @@ def test_lock_errors_of_hdf5_are_explained(tmp_path, monkeypatch, number, words)
 
 def test_the_program_is_refused_with_one_line(tmp_path, other, program):
     (tmp_path / "scene.toml").write_text(beam((2, 1, 1), time={"frames": 2}).to_toml())
-    _, first = other
     command = "simulate", tmp_path / "scene.toml", "-o", tmp_path / "run.h5", "--overwrite"
     status, _, err = program(*command)
     assert status == 1
     assert "is being written by another program" in err
-    first.send([])
-    assert first.recv() == "done"
+    other.send([])
+    assert other.recv() == "done"
     assert program(*command)[0] == 0
     assert np.isfinite(load_trajectory(tmp_path / "run.h5").positions).all()
