@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 _OVER_TIME, _OMEGA = _FIGURES = "errors.png", "omega.png"
 
+
 def evaluate(
     paths: Annotated[
         list[str],
