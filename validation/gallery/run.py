@@ -15,7 +15,7 @@ import pdcorrect as pc
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 FRAMES = {
-    "lifting_gripper": 12, "crawler": 12, "pressure_finger": 8, "dropped_jelly": 14,
+    "lifting_gripper": 12, "crawler": 12, "pressure_finger": 6, "dropped_jelly": 14,
     "twisted_bar": 10, "bracket": 15,
 }  # fmt: skip
 """Few, for converged motions with contact take minutes."""
