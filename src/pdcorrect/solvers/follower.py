@@ -23,7 +23,7 @@ MOST = 60
 DEPTH = 6
 """Earlier iterations that Anderson's acceleration uses."""
 _NOISE = 1e-4
-"""Singular values of their differences, over the largest, that are left to the inner tolerance."""
+"""Singular values of their differences, over the largest, that are noise of inner minima."""
 
 
 class Anderson:
