@@ -9,7 +9,7 @@ import numpy as np
 import pdcorrect as pc
 
 PRESSURE = 5e3
-AT_REST = {"integrator": "quasi-static", "frames": 1}
+AT_REST = {"integrator": "quasi-static", "frames": 1, "substeps": 1}
 
 
 def pressed(scene: pc.Scene, loads: list[dict[str, Any]], **changes: Any) -> pc.Scene:
