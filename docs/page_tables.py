@@ -30,7 +30,7 @@ def time_and_mesh_error() -> Rows:
 
 def gallery() -> Rows:
     """Scenes of the gallery by two elements."""
-    (table,) = read(RECORDS / "gallery.json")["tables"]
+    table, _ = read(RECORDS / "gallery.json")["tables"]
     rows = [
         [name.replace("_", " "), str(nodes), str(frames), *map(number, found)]
         for name, nodes, frames, *found, _ in table["rows"]

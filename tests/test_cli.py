@@ -89,16 +89,20 @@ def test_no_output_is_replaced_unless_told(program, tmp_path, monkeypatch):
         (("simulate", plain, "-o", run), "run.h5"),
         (("simulate", scene, "-o", beside), "b_probes.csv"),
         (("simulate", scene, "-o", beside, "--vtu", tmp_path), "b.pvd"),
+        (("simulate", scene, "-o", beside, "--vtu", tmp_path), "b_0009.vtu"),
         (("simulate", scene, "-o", beside, "--report", tmp_path), "index.html"),
         (("compare", scene, "-o", tmp_path, "--no-figures", "--frames", 1), "index.html"),
         (("compare", scene, "-o", tmp_path, "--no-figures", "--frames", 1), "report.json"),
         (("render", run, "-o", tmp_path / "run.png", "--size", "200x200"), "run.png"),
         (("export", run, "-o", tmp_path, "--no-stress"), "run.pvd"),
+        (("export", run, "-o", tmp_path, "--no-stress"), "run_0000.vtu"),
         (("evaluate", "tiny", "data", "-o", tmp_path, "--no-figures"), "summary.json"),
+        (("evaluate", "tiny", "data", "-o", tmp_path, "--no-figures"), "errors.csv"),
+        (("evaluate", "tiny", "data", "-o", tmp_path), "omega.png"),
         (("dataset", "info", "data", "--json", tmp_path / "info.json"), "info.json"),
     ):
         output = tmp_path / name
-        kept = output.read_bytes() if output.exists() else b"precious"
+        kept = output.read_bytes() if output == run else b"precious"
         output.write_bytes(kept)
         status, _, err = program(*arguments)
         assert (status, output.read_bytes()) == (FAILED, kept)

@@ -1,6 +1,7 @@
 """Loads over a step: momentum of an impulse, order in time, and loads that follow the body."""
 
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -165,3 +166,12 @@ def test_loads_that_do_not_settle_are_told(monkeypatch):
     result = pc.ProjectiveDynamics(problem)(problem.rest_state())
     assert result.status is pc.Status.ITERATION_LIMIT
     assert not result.status.ok
+
+
+def test_loads_settle_at_a_tight_tolerance():
+    """Where inner minima are as far off as the loads' changes are large."""
+    scene = pc.Scene.load(Path(__file__).parents[1] / "examples" / "pressure_finger.toml")
+    load = {**scene.loads[0].model_dump(exclude_none=True), "pressure": 3e4}
+    problem = pc.discretise(scene.with_changes(loads=[load], time={"substeps": 1}))
+    run = pc.rollout(pc.ProjectiveDynamics(problem, tolerance=1e-7), 4)
+    assert set(run.stats["status"]) == {"CONVERGED"}

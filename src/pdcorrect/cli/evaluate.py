@@ -16,6 +16,8 @@ if TYPE_CHECKING:
     from pdcorrect.corrector.gate import Gate
     from pdcorrect.evaluation.evaluation import Evaluation, SavedCandidate
 
+_OVER_TIME, _OMEGA = _FIGURES = "errors.png", "omega.png"
+
 
 def evaluate(
     paths: Annotated[
@@ -45,13 +47,14 @@ def evaluate(
     """
     from pdcorrect.evaluation.evaluation import DEFAULT_GATE, saved_candidates
     from pdcorrect.evaluation.evaluation import evaluate as run
-    from pdcorrect.evaluation.tables import SUMMARY, write_evaluation
+    from pdcorrect.evaluation.tables import FILES, write_evaluation
 
     *models, folder = paths
     if output and figures:
         require_extra("matplotlib", "view")
     if output:
-        check_new(output / SUMMARY, overwrite=overwrite)
+        names = (*FILES, *(_FIGURES if figures else ()))
+        check_new(*(output / name for name in names), overwrite=overwrite)
     refuses = DEFAULT_GATE if gate else None
     saved = saved_candidates(models, device, gate=refuses)
     common.tell_of_compiling()
@@ -143,9 +146,9 @@ def _draw(found: Evaluation, folder: Path) -> list[Path]:
     if errors:
         frames = len(next(iter(errors.values())))
         times = np.linspace(0.0, found.time_step * (frames - 1), frames)
-        drawn.append(plot_error_over_time(errors, times, folder / "errors.png"))
+        drawn.append(plot_error_over_time(errors, times, folder / _OVER_TIME))
     omegas = {name: run.values("omega")[0] for name, run in found.runs.items()}
     shown = {n: x for n, x in omegas.items() if x and n not in (PLAIN, REFERENCE)}
     if shown:
-        drawn.append(plot_omega(shown, folder / "omega.png"))
+        drawn.append(plot_omega(shown, folder / _OMEGA))
     return drawn

@@ -35,11 +35,11 @@ def export(
     smallest det F.
     """
     from pdcorrect._files import check_new, make_folder
-    from pdcorrect.io.vtk import write_vtu_series
+    from pdcorrect.io.vtk import vtu_series, write_vtu_series
 
     loaded = _loaded(run, salvage)
     make_folder(output)
-    check_new(output / f"{run.stem}.pvd", overwrite=overwrite)
+    check_new(*vtu_series(output, run.stem), overwrite=overwrite)
     problem = _stepped(loaded, run) if stress else None
     say(f"wrote {write_vtu_series(loaded, output, every=every, name=run.stem, stress_of=problem)}")
 

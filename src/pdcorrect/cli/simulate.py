@@ -117,12 +117,13 @@ def _check_outputs(
     from pdcorrect._files import check_new, make_folder
     from pdcorrect.evaluation.page import PAGE
     from pdcorrect.io.probes import probes_file
+    from pdcorrect.io.vtk import vtu_series
 
     for folder in filter(None, (vtu, report)):
         make_folder(folder)
     beside = [] if resume else [output]
     beside += [probes_file(output)] if scene.probes else []
-    beside += [vtu / f"{output.stem}.pvd"] if vtu else []
+    beside += vtu_series(vtu, output.stem) if vtu else []
     beside += [report / PAGE] if report else []
     check_new(*beside, overwrite=overwrite or resume)
 

@@ -22,7 +22,8 @@ from pdcorrect.evaluation.measures import TrajectoryMeasures
 VERSION = 1
 """Of ``summary.json``."""
 SUMMARY, TRAJECTORIES, ERRORS, TABLE = "summary.json", "trajectories.csv", "errors.csv", "table.md"
-"""Files of an evaluation."""
+FILES = (SUMMARY, TRAJECTORIES, ERRORS, TABLE)
+"""Of an evaluation."""
 
 MEASURES = tuple(
     f.name for f in fields(TrajectoryMeasures) if f.name not in ("mesh", "simulation", "failed")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import xml.etree.ElementTree as ET
-from collections.abc import Callable, Container, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -74,7 +74,7 @@ def write_vtu_series(
         _check_problem(stress_of, trajectory, name)
     files = {k: f"{name}_{k:04d}.vtu" for k in range(0, len(trajectory.times), every)}
     folder = make_folder(folder)
-    path = folder / f"{name}.pvd"
+    path, *old = vtu_series(folder, name)
     _delete(path)
     for frame, file in files.items():
         positions = trajectory.positions[frame]
@@ -91,23 +91,27 @@ def write_vtu_series(
             },
             {**of_cells, **(cell_data(frame) if cell_data else {})},
         )
-    _delete_frames(folder, name, but=files.values())
+    for other in old:
+        if other.name not in files.values():
+            _delete(other)
     write_bytes(path, _collection({file: trajectory.times[k] for k, file in files.items()}))
     return path
 
 
+def vtu_series(folder: Path, name: str) -> list[Path]:
+    """What a new series of that name replaces: ``name.pvd``, if it is there or not, and frames.
+
+    Frames are ``name_0000.vtu`` and so on, not those of ``name_2026``.
+    """
+    own = re.compile(rf"{re.escape(name)}_\d{{4,}}\.vtu")
+    frames = sorted(path for path in folder.glob("*.vtu") if own.fullmatch(path.name))
+    return [folder / f"{name}.pvd", *frames]
+
+
 def delete_vtu_series(folder: Path, name: str) -> None:
     """Delete ``name.pvd`` and then its frames, and no other series' files."""
-    _delete(folder / f"{name}.pvd")
-    _delete_frames(folder, name, but=())
-
-
-def _delete_frames(folder: Path, name: str, but: Container[str]) -> None:
-    """``name_0000.vtu`` and so on, not those of ``name_2026``, without some."""
-    own = re.compile(rf"{re.escape(name)}_\d{{4,}}\.vtu")
-    for path in folder.glob("*.vtu"):
-        if own.fullmatch(path.name) and path.name not in but:
-            _delete(path)
+    for path in vtu_series(folder, name):
+        _delete(path)
 
 
 def _delete(path: Path) -> None:

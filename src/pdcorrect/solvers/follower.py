@@ -22,6 +22,8 @@ MOST = 60
 """Fixed-point iterations of a step."""
 DEPTH = 6
 """Earlier iterations that Anderson's acceleration uses."""
+_NOISE = 1e-4
+"""Singular values of their differences, over the largest, that are noise of inner minima."""
 
 
 class Anderson:
@@ -38,7 +40,7 @@ class Anderson:
         if len(self._images) == 1:
             return image
         steps = np.diff(np.stack(self._residuals, axis=1), axis=1)
-        weights = np.linalg.lstsq(steps, self._residuals[-1], rcond=1e-8)[0]
+        weights = np.linalg.lstsq(steps, self._residuals[-1], rcond=_NOISE)[0]
         return image - np.diff(np.stack(self._images, axis=1), axis=1) @ weights
 
 
