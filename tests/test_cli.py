@@ -85,7 +85,6 @@ def test_no_output_is_replaced_unless_told(program, tmp_path, monkeypatch):
     beside, plain = tmp_path / "b.h5", tmp_path / "plain.toml"
     plain.write_text(beam((4, 1, 1), time={"frames": 1}).to_toml())
     for arguments, name in (
-        (("simulate", scene, "-o", run), "run_probes.csv"),
         (("simulate", plain, "-o", run), "run.h5"),
         (("simulate", scene, "-o", beside), "b_probes.csv"),
         (("simulate", scene, "-o", beside, "--vtu", tmp_path), "b.pvd"),

@@ -3,6 +3,8 @@
 import hashlib
 import json
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -197,20 +199,23 @@ def test_after_an_error_while_writing_the_old_model_is_there(model, monkeypatch,
     assert {p.name: p.read_bytes() for p in model.iterdir()} == before
 
 
-def save_and_die(_, model):
-    """Between the two files."""
-    replace = Path.replace
-
-    def killed(part, path):
-        replace(part, path)
-        os._exit(9)
-
-    Path.replace = killed
-    saved(model, seed=1)
-
-
-def test_a_kill_between_the_two_files_is_told(model, fork):
-    assert fork(save_and_die, model).join() == 9
+def test_a_kill_between_the_two_files_is_told(tmp_path, model):
+    script = (
+        "import os, sys\n"
+        "from pathlib import Path\n"
+        "from test_corrector_model import saved\n"
+        "replace = Path.replace\n"
+        "def killed(part, path):\n"
+        "    replace(part, path)\n"
+        "    os._exit(9)\n"
+        "Path.replace = killed\n"
+        f"saved(Path({str(model)!r}), seed=1)\n"
+    )
+    here = str(Path(__file__).parent)
+    paths = os.pathsep.join([here, str(Path(pc.__file__).parents[1])])
+    environment = {**os.environ, "PYTHONPATH": paths}
+    done = subprocess.run([sys.executable, "-c", script], env=environment, check=False)
+    assert done.returncode == 9
     with pytest.raises(FileFormatError, match=rf"{WEIGHTS}: its checksum"):
         load_model(model)
     saved(model, seed=1)

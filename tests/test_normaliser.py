@@ -289,8 +289,6 @@ def test_bodies_that_have_no_graph_are_refused():
         ("compact", {"width": 0}, "width = 0"),
         ("compact", {"mlp_layers": 1}, "mlp_layers = 1"),
         ("compact", {"clip": 0.0}, "clip = 0.0"),
-        ("compact", {"norm": "some"}, 'norm = "some"'),
-        ("compact", {"placement": "after"}, 'placement = "after"'),
         ("compact", {"depth": 3}, "'compact': depth: unknown key"),
         ("compact", {"widths": 3}, "'compact': widths: unknown key.*width"),
         ("large", {}, "'large'.*thesis, equivariant, compact"),

@@ -28,7 +28,7 @@ FIGURES = (
     "error_time", "unlike_families", "easy_to_hard", "four_errors", "time_orders", "energy",
     "stability", "cook", "locking", "turek_hron",
 )  # fmt: skip
-"""Cases that are told with a figure, in the order of the page."""
+"""The order of the cases that draw one."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ def finding(case: harness.Case, record: harness.Record) -> str:
 
 def figure(case: harness.Case, record: harness.Record, folder: Path) -> str:
     """Draw a case's figure from its record; its path in the folder, "" if it has none."""
-    if case.name not in FIGURES or importlib.util.find_spec("matplotlib") is None:
+    if not hasattr(case.module, "draw") or importlib.util.find_spec("matplotlib") is None:
         return ""
     place = make_folder(folder / "figures") / f"{case.name}.png"
     with tempfile.TemporaryDirectory() as scratch:  # a figure is there whole or not at all
@@ -120,12 +120,12 @@ def measured(record: harness.Record) -> str:
 def on_page(sections: Sequence[Section]) -> tuple[list[Section], list[Section]]:
     """Those that are told with a figure, in the page's order, and the others."""
     told = [each for each in sections if each.figure]
-    told.sort(key=lambda each: FIGURES.index(each.case.name))
+    told.sort(key=lambda each: (*FIGURES, each.case.name).index(each.case.name))
     return told, [each for each in sections if not each.figure]
 
 
 def markdown(sections: Sequence[Section]) -> Iterator[str]:
-    """A sentence and a figure for each case of `FIGURES`, and a row for each other."""
+    """A sentence and a figure for each case that has one, and a row for each other."""
     yield from ("# Validation report", "", conditions(sections), "")
     told, others = on_page(sections)
     for number, each in enumerate(told, start=1):

@@ -76,9 +76,9 @@ def repaid(
         every = whole(reached, measured["frames"][scene], measured["set_up"][scene])
         of = {simulation.name: simulation for simulation in every}
         own = of[name]
+        others = [of[other] for other in fixed(name)]
         rival = time_at(own.error, [s for s in every if s.name in RIVALS])
         equal = None if math.isnan(rival) else simulations(cost, own.time, rival)
-        others = [of[other] for other in fixed(name)]
         by_time = tuple(simulations(cost, own.time, other.time) for other in others)
         near = tuple(own.error <= other.error for other in others)
         out.append(Repaid(scene, equal, by_time, near))

@@ -247,7 +247,8 @@ class Space:
         """Quadrature on the boundary faces with corner nodes ``faces`` (n, 4)."""
         key = {tuple(f): i for i, f in enumerate(np.sort(self._mesh.facets, axis=0).T.tolist())}
         numbers = np.array([key[tuple(sorted(f))] for f in faces.tolist()], dtype=np.int64)
-        basis = FacetBasis(self._mesh, self._element, facets=numbers, intorder=self._kind.order)
+        near = self._mesh.translated(-self._mesh.doflocs.min(axis=1))  # inverse maps need digits
+        basis = FacetBasis(near, self._element, facets=numbers, intorder=self._kind.order)
         values = [
             np.broadcast_to(np.asarray(basis.basis[k][0]), basis.dx.shape) for k in self._to_vtk
         ]
