@@ -130,8 +130,8 @@ def _scaled(base: dict[str, Any], load: dict[str, Any], name: str, share: float)
     weak = {key: x for key, x in load.items() if key not in ("window", "ramp")}
     weak[name] = (small * value).tolist()
     time = {"step": 1.0, "frames": 1, "integrator": "quasi-static"}
-    still = pc.Scene(**{**base, "time": time, "loads": [weak], "solver": {"tolerance": 1e-7}})
-    run = pc.rollout(pc.Newton(pc.discretise(pc.best_coarse(still))))
+    still = pc.Scene(**{**base, "time": time, "loads": [weak]})
+    run = pc.rollout(pc.Newton(pc.discretise(pc.best_coarse(still)), tolerance=1e-7))
     moved = np.linalg.norm(run.positions[-1] - run.points, axis=1).max() / small
     factor = share * np.ptp(run.points, axis=0).max() / moved
     rounded = [float(f"{x:.4g}") for x in np.atleast_1d(factor * value)]
