@@ -252,3 +252,13 @@ def test_scenes_in_other_codings(tmp_path, coding):
         return
     with pytest.raises(SceneError, match="UTF-16" if coding == "utf-16" else "UTF-8"):
         pc.Scene.load(path)
+
+
+def test_one_table_where_a_list_belongs_is_told_of_its_brackets():
+    text = beam().to_toml()
+    assert "[[loads]]" in text
+    with pytest.raises(SceneError, match=r"\[\[loads\]\]"):
+        pc.Scene.from_toml(text.replace("[[loads]]", "[loads]"))
+    with pytest.raises(SceneError, match="origin = 5") as told:
+        beam(body={"origin": 5})
+    assert "[[" not in str(told.value)

@@ -60,14 +60,14 @@ _WORDS = {
     "dict_type": "expected a table of keys",
     "float_type": "expected a number",
     "int_type": "expected an integer",
-    "list_type": "expected a list (a table of it begins with [[, as in [[loads]])",
+    "list_type": "expected a list",
     "model_attributes_type": "expected a table of keys",
     "model_type": "expected a table of keys",
     "path_type": "expected a path",
     "string_type": "expected a string",
     "too_long": "expected a list of at most {max_length}, got {actual_length}",
     "too_short": "expected a list of at least {min_length}, got {actual_length}",
-    "tuple_type": "expected a list (a table of it begins with [[, as in [[loads]])",
+    "tuple_type": "expected a list",
     "union_tag_invalid": "expected one of {expected_tags}",
 }
 """By the type of pydantic's error, where its own words would tell of Python."""
@@ -224,6 +224,8 @@ def _sentence(item: ErrorDetails, tables: Sequence[_Table]) -> tuple[str, str]:
         return key, "missing; a value is required."
     told = item["msg"].removeprefix("Value error, ").replace("Input should be", "expected")
     told = _WORDS[kind].format(**context) if kind in _WORDS else told
+    if kind in ("list_type", "tuple_type") and isinstance(value, dict):
+        told += f": begin the table with [[{key}]]"
     if key and (value is not None or kind != "value_error"):
         key = f"{key} = {_shown(value)}"
     return key, f"{told[:1].lower()}{told[1:]}" if key else told

@@ -46,8 +46,8 @@ def limited_threads() -> Iterator[None]:
     """BLAS on one thread, and the kernels too on a busy machine.
 
     Idle BLAS threads spin and take the kernels' cores, and the products here are too small to gain
-    from them.  Kernels on two threads take up to twice as long as on one where other programs want
-    the cores, and two thirds where none does (``benchmarks``, case busy).
+    from them.  Kernels on two threads take up to three times as long as on one where other programs
+    want the cores, and two thirds where none does (``benchmarks``, case busy).
     """
     before = numba.get_num_threads()
     with _one_blas_thread:
