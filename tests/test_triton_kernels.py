@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from pdcorrect.batch import correction, points, triton_kernels, viscosity
+from pdcorrect.batch import points, triton_kernels, turned_strains, viscosity
 from pdcorrect.batch.triton_kernels import Program
 from pdcorrect.errors import MissingExtraError
 from pdcorrect.fem.hyperelasticity import COROTATED, NEO_HOOKEAN, ST_VENANT_KIRCHHOFF
@@ -140,16 +140,45 @@ def test_kernels_compute_what_torch_does(request, dtype, model, first):
     torch.testing.assert_close(found, expected, rtol=tolerance, atol=tolerance, check_stride=True)
 
 
-STRETCHES = {"viscosity": (viscosity._stretch, (6, 9, 3, 9)),
-             "learned element": (correction._stretch, (9, 9, 9))}  # fmt: skip
-
-
-@pytest.mark.parametrize(("function", "sizes"), STRETCHES.values(), ids=STRETCHES)
-def test_stretches_have_kernels_too(interpreted, function, sizes):
+def test_stretches_have_kernels_too(interpreted):
     H = gradients(torch.float64)[:, 4:].contiguous()
-    found = points.computed(function, [H], sizes)
-    for got, expected in zip(found, function(list(H)), strict=True):
+    found = points.computed(viscosity._stretch, [H], (6, 9, 3, 9))
+    for got, expected in zip(found, viscosity._stretch(list(H)), strict=True):
         torch.testing.assert_close(got, torch.stack(expected), rtol=1e-12, atol=1e-12)
+
+
+def test_learned_elements_have_kernels_too(interpreted):
+    rng = np.random.default_rng(2)
+
+    def some(*sizes):
+        return [torch.as_tensor(rng.normal(size=(k, 30, 1))) for k in sizes]
+
+    v, (size,) = 0.2 * some(21)[0], torch.rand(1, 1, 30, 1, dtype=torch.float64) + 1.0
+    at = check(turned_strains.frame, [v, size], (9, 9, 9, 9, 18, 8, 18))[:-1]
+    raw, dv, more = some(18, 21, 18)
+    y, w, _ = check(turned_strains.derivatives, [*at, raw], (18, 3, 21))
+    known = check(turned_strains.rates, [*at, dv], (18, 9, 1, 3, 18))[:-1]
+    check(turned_strains.changes, [*at, raw, y, w, *known, more], (21,))
+
+
+def check(function, inputs, sizes):
+    """What a kernel computes, which is what torch does."""
+    found = points.computed(function, inputs, sizes)
+    expected = [torch.stack(x) for x in function(*(list(x) for x in inputs))]
+    torch.testing.assert_close(found, expected, rtol=1e-12, atol=1e-12)
+    return found
+
+
+@pytest.mark.parametrize("alike", [True, False])
+def test_deformation_of_scenes_has_a_kernel(interpreted, alike):
+    """Of gradients that all cells of a scene share, and of each cell's own."""
+    rows = torch.rand(2, 5, 3, 11, dtype=torch.float64)
+    shape = (2, 11, 51) if alike else (2, 5, 11, 51)
+    gradients = torch.rand(*shape, dtype=torch.float64)
+    each = gradients[:, None].expand(2, 5, 11, 51) if alike else gradients
+    expected = torch.einsum("bcil,bcljq->ijbcq", rows, each.unflatten(-1, (3, 17)))
+    found = points.deformation(rows, gradients)
+    torch.testing.assert_close(found, expected.reshape(9, 10, 17), rtol=1e-13, atol=1e-13)
 
 
 @needs_gpu

@@ -21,7 +21,7 @@ from torch import Tensor
 
 from pdcorrect.batch.correction import BatchCorrection
 from pdcorrect.batch.gpu import assembled, at_corners, in_cells, sums
-from pdcorrect.batch.points import Points, Tangent
+from pdcorrect.batch.points import Points, Tangent, deformation
 from pdcorrect.errors import InputError
 from pdcorrect.fem.problem import Problem
 from pdcorrect.fem.quadrature import Quadrature
@@ -224,9 +224,11 @@ class CellBatch:
     def gradients(self, u: Tensor) -> Tensor:
         """H = sum_k u_k grad N_k, (9, B C, Q), for (B, U, 3)."""
         n = self.sizes
-        rows = in_cells(u, self._corners, n.modes).reshape(*self._rows, n.width)
-        by_cell = (rows @ self._gradients).reshape(-1, 9, n.points).transpose(0, 1)
-        return by_cell if u.is_cuda else by_cell.contiguous()
+        rows = in_cells(u, self._corners, n.modes)
+        if u.is_cuda:
+            return deformation(rows, self._gradients)
+        by_cell = rows.reshape(*self._rows, n.width) @ self._gradients
+        return by_cell.reshape(-1, 9, n.points).transpose(0, 1).contiguous()
 
     def gathered(self, P: Tensor) -> Tensor:
         """sum_q P_ij dN_k/dx_j summed over the cells, (B, U, 3), for P (9, B C, Q)."""

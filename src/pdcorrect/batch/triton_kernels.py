@@ -177,8 +177,9 @@ _files = itertools.count()
 def at_points(function: PointFunction, inputs: Sequence[Tensor], outputs: Sequence[Tensor]) -> None:
     """Fill ``outputs`` with the function of ``inputs`` at every point, on a GPU.
 
-    All tensors are (k, C, Q) for k components at Q points of C cells, anywhere in memory.  The
-    function's kernel is found again by its identity: pass the same object each time.
+    All tensors are (k, C, Q) for k components at Q points of C cells, or (k, B, C, Q) in B scenes,
+    anywhere in memory.  The function's kernel is found again by its identity: pass the same object
+    each time.
 
     Raises
     ------
@@ -190,15 +191,17 @@ def at_points(function: PointFunction, inputs: Sequence[Tensor], outputs: Sequen
     first, tensors = outputs[0], [*inputs, *outputs]
     if len({(x.shape[1:], x.dtype, x.device) for x in tensors}) > 1:
         raise ValueError("expected tensors of the same points, type and device")
-    _, cells, points = first.shape
-    count = cells * points
+    *scenes, cells, points = first.shape[1:]
+    count = first[0].numel()
     if not count:
         return
     sizes = tuple(len(x) for x in inputs)
     kernel = _kernel(function, sizes, first.dtype)
-    strides = [s for x in tensors for s in x.stride()]
+    strides = [s for x in tensors for s in (x if scenes else x[:, None]).stride()]
     with torch.cuda.device(first.device):
-        kernel[(-(-count // BLOCK),)](*tensors, *strides, count, points, BLOCK=BLOCK, num_warps=4)
+        kernel[(-(-count // BLOCK),)](
+            *tensors, *strides, count, cells, points, BLOCK=BLOCK, num_warps=4
+        )
 
 
 @cache
@@ -226,17 +229,22 @@ def _name(function: PointFunction) -> str:
 
 
 def kernel_source(program: Program, name: str) -> str:
-    """A Triton kernel in Python: tensors, their strides, how many points, and points of a cell."""
+    """A Triton kernel in Python.
+
+    Of tensors, their strides, how many points, and how many cells a scene and points a cell has.
+    """
     every = [f"x{i}" for i in range(len(program.inputs))]
     every += [f"y{i}" for i in range(len(program.outputs))]
-    strides = [f"{x}_{axis}" for x in every for axis in ("component", "cell", "point")]
+    strides = [f"{x}_{axis}" for x in every for axis in ("component", "scene", "cell", "point")]
+    arguments = [*every, *strides, "count", "cells", "points", "BLOCK: tl.constexpr"]
     lines = [
-        f"def {name}({', '.join([*every, *strides, 'count', 'points', 'BLOCK: tl.constexpr'])}):",
+        f"def {name}({', '.join(arguments)}):",
         "lane = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)",
         "within = lane < count",
-        "cell = (lane // points).to(tl.int64)",
+        "scene = (lane // (cells * points)).to(tl.int64)",
+        "cell = (lane // points % cells).to(tl.int64)",
         "point = (lane % points).to(tl.int64)",
-        *(f"{x} = {x} + cell * {x}_cell + point * {x}_point" for x in every),
+        *(f"{x} = {x} + scene * {x}_scene + cell * {x}_cell + point * {x}_point" for x in every),
     ]
     for number, operation in enumerate(program.lines):
         lines.append(f"v{number} = {_text(program, operation.name, operation.operands)}")
