@@ -146,7 +146,7 @@ def test_the_bound_of_eigenvalues_is_one_and_close(element, poisson):
     problem = pc.discretise(beam((3, 1, 1), poisson=poisson, solver={"element": element}), 2)
     cells, owners = pc.BatchStepper([problem]).cells, torch.tensor([0])
     whole = rest_blocks(problem, 1.0, True)
-    (kept,) = Elimination(cells, [whole], owners, 8, 3).blocks
+    (kept,) = Elimination(cells, [whole], owners, 8, 3, torch.float64).blocks
     blocks, nodal = with_mass(problem, kept, MASS)
     A = summed_blocks(problem.cells, blocks, len(nodal), CPU).numpy()
     free = problem.free.ravel()

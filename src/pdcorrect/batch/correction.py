@@ -134,7 +134,7 @@ class BatchCorrection:
         """The state with derivatives (B, C, 18) by what is left of z."""
         raw = _components(stress)
         after = computed(turned_strains.derivatives, [*found[:-1], raw], (18, 3, 21))
-        return _State(*found, raw, *after)
+        return _State(*(*found, raw, *after))
 
     def _potential(self, at: _State, before: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Half of (z - before) . raw of each scene, and minus its derivatives."""

@@ -55,14 +55,21 @@ class Elimination:
 
     ``blocks`` (C or 1, w L, w L) are of each distinct problem's cells, one for all; ``owners`` (B,)
     which of them each scene has; ``nodes`` K a cell has, its other shape functions are modes; a
-    node has ``width`` w unknowns: 1 where blocks are the same for all coordinates, or 3.  The
-    attribute ``blocks`` is of the nodes, (C or 1, w K, w K), with the modes eliminated.
+    node has ``width`` w unknowns: 1 where blocks are the same for all coordinates, or 3.  Matrices
+    are kept in the type ``storage``.  The attribute ``blocks`` is of the nodes,
+    (C or 1, w K, w K), with the modes eliminated.
     """
 
     def __init__(
-        self, cells: CellBatch, blocks: Sequence[Array], owners: Tensor, nodes: int, width: int
+        self,
+        cells: CellBatch,
+        blocks: Sequence[Array],
+        owners: Tensor,
+        nodes: int,
+        width: int,
+        storage: torch.dtype,
     ) -> None:
-        self._cells, self._nodes, self._width = cells, nodes, width
+        self._cells, self._nodes, self._width, self._storage = cells, nodes, width, storage
         if not cells.sizes.modes:
             self.blocks = list(blocks)
             return
@@ -91,17 +98,20 @@ class Elimination:
     def _stored(self, arrays: Sequence[Array]) -> Tensor:
         """(K, m, n) where all cells of each problem are alike, else (K, C, m, n)."""
         if all(len(a) == 1 for a in arrays):
-            return self._cells.tensor(np.concatenate(arrays))
+            return self._cells.tensor(np.concatenate(arrays)).to(self._storage)
         count = self._cells.sizes.cells
         every = [np.broadcast_to(a, (count, *a.shape[1:])) if len(a) == 1 else a for a in arrays]
-        return self._cells.tensor(padded(every, (count, *every[0].shape[1:])))
+        return self._cells.tensor(padded(every, (count, *every[0].shape[1:]))).to(self._storage)
 
     def _times(self, matrices: Tensor, local: Tensor) -> Tensor:
         """Matrices times the values (B, C, k, 3) in each cell."""
+        values = local.to(self._storage)
         if self._width == 3:
-            flat = local.reshape(*local.shape[:2], -1, 1)
-            return cellwise(matrices, flat).reshape(*local.shape[:2], -1, 3)
-        return cellwise(matrices, local)
+            flat = values.reshape(*local.shape[:2], -1, 1)
+            values = cellwise(matrices, flat).reshape(*local.shape[:2], -1, 3)
+        else:
+            values = cellwise(matrices, values)
+        return values.to(local.dtype)
 
 
 def cellwise(matrices: Tensor, x: Tensor) -> Tensor:

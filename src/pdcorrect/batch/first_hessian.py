@@ -128,7 +128,8 @@ class FirstHessian:
         self._turned = kind in ("rest", "multigrid")
         width = 3 if self._turned else 1
         blocks = [_blocks(p, factors[1], kind) for p in distinct]
-        self._modes = Elimination(cells, blocks, owners, problems[0].cells.shape[1], width)
+        nodes = problems[0].cells.shape[1]
+        self._modes = Elimination(cells, blocks, owners, nodes, width, storage)
         del blocks
         self._solver: DenseInverse | BatchMultigrid
         if kind == "multigrid":

@@ -90,7 +90,8 @@ def deformation(rows: Tensor, gradients: Tensor) -> Tensor:
     shape functions.  Matrix libraries take ten times as long for such small products.
     """
     scenes, cells = rows.shape[:2]
-    by_function = gradients.unflatten(-1, (3, -1)).flatten(-3, -2)  # (B, 3 L, Q), (B, C, 3 L, Q)
+    *several, width, _ = gradients.shape
+    by_function = gradients.reshape(*several, 3 * width, -1)
     if gradients.ndim == 3:
         by_function = by_function[:, None].expand(-1, cells, -1, -1)
     points = by_function.shape[-1]
