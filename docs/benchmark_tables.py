@@ -9,13 +9,12 @@ from typing import Any
 from records import Rows, number, read
 
 RESULTS = "benchmarks/results"
-AMD, INTEL, H200, H100 = (
+AMD, INTEL, H200 = (
     f"{RESULTS}/{name}.json"
     for name in (
         "amd-epyc-2cores",
         "intel-r-xeon-r-processor-2cores",
         "nvidia-h200",
-        "nvidia-h100-80gb-hbm3",
     )
 )
 TOLERANCE = 1e-4
@@ -117,16 +116,18 @@ def elements() -> Rows:
 
 def batch_elements() -> Rows:
     """256 scenes of 405 nodes, and 16 of the fine mesh, on a GPU."""
+    found = results_of(H200, "batch elements")
     rows = [
         [
             f"`{row['element']}`", str(row["nodes"]), str(row["scenes"]),
-            number(row["step_ms_a_scene"]), number(row["backward_ms"] / row["scenes"]),
-            number(row["memory_bytes"] / 1e9, 2),
+            number(row["step_ms_a_scene"]),
+            number(found[-1]["step_ms_a_scene"] / row["step_ms_a_scene"], 2),
+            number(row["backward_ms"] / row["scenes"]), number(row["memory_bytes"] / 1e9, 2),
         ]
-        for row in results_of(H100, "batch elements")
+        for row in found
     ]  # fmt: skip
-    head = ("element", "nodes", "scenes", "step, ms a scene", "derivative, ms a scene",
-            "memory, GB")  # fmt: skip
+    head = ("element", "nodes", "scenes", "step, ms a scene", "fine step over it",
+            "derivative, ms a scene", "memory, GB")  # fmt: skip
     return head, rows
 
 
