@@ -1,14 +1,17 @@
 """Contact with obstacles: geometry, derivatives, statics, friction, impact, bad input."""
 
+import numba
 import numpy as np
 import pytest
 
 import pdcorrect as pc
 from conftest import beam, slow_unless
 from pdcorrect.errors import InputError, PdcorrectWarning, SceneError
+from pdcorrect.fem import contact, obstacles
 from pdcorrect.fem.contact import barrier
 from pdcorrect.fem.obstacles import RigidObstacle
 from pdcorrect.scene import Box, Cylinder, Plane, Sphere
+from pdcorrect.solvers import contact as friction
 from pdcorrect.solvers.implicit import _Effort
 from pdcorrect.solvers.tangent_solver import TangentFactory
 
@@ -323,6 +326,37 @@ def test_a_body_too_near_an_obstacle_is_pushed_away(stepper):
     assert result.status.ok
     assert result.stats["smallest_gap"] > 0.1 * problem.contact.distances[0]
     assert result.residual < 1e-3 * 9.81 * problem.mass.sum()
+
+
+KERNELS = {
+    contact: ["barrier", "_add_product", "_add_blocks"],
+    friction: ["_friction", "_friction_tangent"],
+    obstacles: ["_gaps", "_derivatives", "_first_hit"],
+}
+
+
+@pytest.mark.parametrize("stepper", [pc.Newton, pc.ProjectiveDynamics])
+def test_the_first_step_that_touches_compiles_nothing(stepper, monkeypatch):
+    run = set()
+
+    def watch(module, name):
+        kernel = getattr(module, name)
+
+        def watched(*args):
+            run.add((name, *map(numba.typeof, args)))
+            return kernel(*args)
+
+        monkeypatch.setattr(module, name, watched)
+
+    for module, names in KERNELS.items():
+        for name in names:
+            watch(module, name)
+    falling = block([{**FLOOR, "friction": 0.4}], 1e-3, initial={"velocity": [0, 0, -1.0]})
+    problem = pc.discretise(falling)
+    made = stepper(problem).prepare()
+    prepared = set(run)
+    assert made(problem.initial_state()).stats["contact_energy"] > 0.0
+    assert run == prepared
 
 
 @pytest.mark.parametrize("stepper", [pc.Newton, pc.ProjectiveDynamics])
