@@ -449,11 +449,14 @@ def test_wrong_obstacles_are_refused_by_name(obstacle, key):
 
 def test_batches_and_correctors_refuse_obstacles():
     pytest.importorskip("torch")
-    problem = pc.discretise(block())
+    solver, time = {"element": "hex27"}, {"step": 0.01, "substeps": 2}
+    problem = pc.discretise(block(solver=solver, time=time))
     with pytest.raises(InputError, match="obstacles"):
         pc.BatchStepper([problem])
-    with pytest.raises(InputError, match="obstacles"):
+    with pytest.raises(InputError) as refused:
         pc.HybridStepper(pc.ProjectiveDynamics(problem), None)
+    for reason in ("obstacles", "27 nodes", "substeps = 2"):  # all in one
+        assert reason in str(refused.value)
 
 
 def test_small_obstacles_are_warned_of():
