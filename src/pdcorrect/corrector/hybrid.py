@@ -288,10 +288,7 @@ def _without(known: Known) -> Known:
 
 
 def hybrid_of(
-    scene: Scene,
-    model: str | Path | LoadedModel,
-    *,
-    gate: bool | Gate | None = True,
+    scene: Scene, model: str | Path | LoadedModel, *, gate: bool | Gate | None = True
 ) -> HybridStepper:
     """Projective dynamics on the coarse model that a corrector was trained for, corrected.
 
