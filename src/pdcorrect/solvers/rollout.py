@@ -152,7 +152,7 @@ def rollout(
     """
     if not hasattr(stepper, "problem"):
         raise InputError(
-            f"stepper is a {type(stepper).__name__}: expected one, as pc.ProjectiveDynamics(problem)."
+            f"stepper is a {type(stepper).__name__}: expected pc.ProjectiveDynamics(problem)."
         )
     states = [stepper.problem.initial_state() if state is None else state]
     log = StepLog()
