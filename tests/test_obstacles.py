@@ -477,10 +477,7 @@ def test_what_obstacles_exclude_is_refused():
         pc.contact_forces(problem, inside)
     result = pc.Newton(problem)(inside)
     assert result.status is pc.Status.NOT_FINITE
-
-
-def test_derivatives_by_obstacles_need_obstacles():
-    problem = pc.discretise(block([]))
+    problem = pc.discretise(block([]))  # where there are none
     stepper, state = pc.Newton(problem), problem.initial_state()
     found = pc.adjoint(stepper, state, stepper(state), np.ones_like(state.positions))
     with pytest.raises(InputError, match="obstacles"):
