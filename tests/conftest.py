@@ -179,6 +179,7 @@ class Copy:
         there.close()
         self.name = function.__name__
         self.send, self.kill = self._pipe.send, self._process.kill
+        self.terminate = self._process.terminate
 
     def recv(self):
         if not self._pipe.poll(LIMIT):

@@ -82,6 +82,9 @@ def test_no_output_is_replaced_unless_told(program, tmp_path, monkeypatch):
     scene, run = tmp_path / "scene.toml", tmp_path / "run.h5"
     scene.write_text(beam((4, 1, 1), time={"frames": 1}, probes=probes).to_toml())
     assert program("simulate", scene, "-o", run)[0] == 0
+    text = scene.read_bytes()
+    assert program("simulate", scene, "-o", scene, "--overwrite")[0] == BAD_INPUT
+    assert scene.read_bytes() == text
     beside, plain = tmp_path / "b.h5", tmp_path / "plain.toml"
     plain.write_text(beam((4, 1, 1), time={"frames": 1}).to_toml())
     for arguments, name in (

@@ -150,6 +150,10 @@ def test_the_learned_element_is_there_once_and_called_so(program, thick, tmp_pat
         assert case.plain == (scene is own)
         assert ("coarse PD" in labels(cases)) == (scene is thick)
         assert labels(cases).count(f"{LEARNED.label}, generalised-alpha") == 1
+    found = {row.label: row for row in pc.compare(own, 2).rows}
+    error, zero = (found[x].rms_error for x in ("learned coarse PD", "best coarse PD"))
+    assert found["best coarse PD"].omega == 0.0
+    assert found["learned coarse PD"].omega == pytest.approx(100 * (1 - (error / zero) ** 2))
     (tmp_path / "scene.toml").write_text(thick.with_changes(solver={"element": "hex27"}).to_toml())
     for command in ("simulate", "compare"):  # it has not all nodes
         arguments = ("--learned", "-o", tmp_path / "out")

@@ -595,7 +595,7 @@ def test_a_file_at_which_vtk_dies_is_refused(tmp_path):
     text = path.read_text()
     assert "DIMENSIONS 3 2 2" in text
     path.write_text(text.replace("DIMENSIONS 3 2 2", "DIMENSIONS 30000 30000 30000"))
-    child = [sys.executable, "-m", "pdcorrect.fem.vtk_process", path, tmp_path / "grid.npz"]
+    child = [sys.executable, "-m", "pdcorrect.fem.vtk_process", path, tmp_path / "grid.npz", ""]
     assert subprocess.run(child, capture_output=True).returncode != 0
     with pytest.raises(MeshError, match="cubes.vtk: cannot be read by VTK"):
         read_hex_mesh(path)

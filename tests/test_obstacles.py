@@ -1,14 +1,17 @@
 """Contact with obstacles: geometry, derivatives, statics, friction, impact, bad input."""
 
+import numba
 import numpy as np
 import pytest
 
 import pdcorrect as pc
 from conftest import beam, slow_unless
 from pdcorrect.errors import InputError, PdcorrectWarning, SceneError
+from pdcorrect.fem import contact, obstacles
 from pdcorrect.fem.contact import barrier
 from pdcorrect.fem.obstacles import RigidObstacle
 from pdcorrect.scene import Box, Cylinder, Plane, Sphere
+from pdcorrect.solvers import contact as friction
 from pdcorrect.solvers.implicit import _Effort
 from pdcorrect.solvers.tangent_solver import TangentFactory
 
@@ -325,6 +328,37 @@ def test_a_body_too_near_an_obstacle_is_pushed_away(stepper):
     assert result.residual < 1e-3 * 9.81 * problem.mass.sum()
 
 
+KERNELS = {
+    contact: ["barrier", "_add_product", "_add_blocks"],
+    friction: ["_friction", "_friction_tangent"],
+    obstacles: ["_gaps", "_derivatives", "_first_hit"],
+}
+
+
+@pytest.mark.parametrize("stepper", [pc.Newton, pc.ProjectiveDynamics])
+def test_the_first_step_that_touches_compiles_nothing(stepper, monkeypatch):
+    run = set()
+
+    def watch(module, name):
+        kernel = getattr(module, name)
+
+        def watched(*args):
+            run.add((name, *map(numba.typeof, args)))
+            return kernel(*args)
+
+        monkeypatch.setattr(module, name, watched)
+
+    for module, names in KERNELS.items():
+        for name in names:
+            watch(module, name)
+    falling = block([{**FLOOR, "friction": 0.4}], 1e-3, initial={"velocity": [0, 0, -1.0]})
+    problem = pc.discretise(falling)
+    made = stepper(problem).prepare()
+    prepared = set(run)
+    assert made(problem.initial_state()).stats["contact_energy"] > 0.0
+    assert run == prepared
+
+
 @pytest.mark.parametrize("stepper", [pc.Newton, pc.ProjectiveDynamics])
 def test_a_column_that_a_plate_squeezes_ends_at_a_minimum(stepper):
     """Straight it would be at a saddle, along which no force shows the way down."""
@@ -415,11 +449,14 @@ def test_wrong_obstacles_are_refused_by_name(obstacle, key):
 
 def test_batches_and_correctors_refuse_obstacles():
     pytest.importorskip("torch")
-    problem = pc.discretise(block())
+    solver, time = {"element": "hex27"}, {"step": 0.01, "substeps": 2}
+    problem = pc.discretise(block(solver=solver, time=time))
     with pytest.raises(InputError, match="obstacles"):
         pc.BatchStepper([problem])
-    with pytest.raises(InputError, match="obstacles"):
+    with pytest.raises(InputError) as refused:
         pc.HybridStepper(pc.ProjectiveDynamics(problem), None)
+    for reason in ("obstacles", "27 nodes", "substeps = 2"):  # all in one
+        assert reason in str(refused.value)
 
 
 def test_small_obstacles_are_warned_of():
@@ -440,10 +477,7 @@ def test_what_obstacles_exclude_is_refused():
         pc.contact_forces(problem, inside)
     result = pc.Newton(problem)(inside)
     assert result.status is pc.Status.NOT_FINITE
-
-
-def test_derivatives_by_obstacles_need_obstacles():
-    problem = pc.discretise(block([]))
+    problem = pc.discretise(block([]))  # where there are none
     stepper, state = pc.Newton(problem), problem.initial_state()
     found = pc.adjoint(stepper, state, stepper(state), np.ones_like(state.positions))
     with pytest.raises(InputError, match="obstacles"):

@@ -18,9 +18,10 @@ import numpy as np
 import pytest
 
 import pdcorrect as pc
-from conftest import beam
+from conftest import LIMIT, beam
 from motion import assert_same, remembering, trajectory
-from pdcorrect._files import INTERRUPTED, TERMINATED, Terminated
+from pdcorrect import _files
+from pdcorrect._files import INTERRUPTED, TERMINATED, Terminated, terminable
 from pdcorrect.cli import main
 from pdcorrect.cli.common import BAD_INPUT, FAILED
 from pdcorrect.errors import FileFormatError, InputError, OutputError
@@ -594,6 +595,27 @@ def wait_for(process, condition):
     """Wait until the condition holds or the process has ended."""
     while process.poll() is None and not condition():
         time.sleep(0.002)
+
+
+def swallow(pipe):
+    with terminable():
+        try:
+            pipe.send("started")
+            time.sleep(LIMIT)
+        except BaseException:  # as some library might
+            pipe.send("swallowed")
+        time.sleep(LIMIT)
+
+
+def test_a_second_sigterm_ends_what_has_lost_the_first(fork, monkeypatch):
+    monkeypatch.setattr(_files, "_CLOSING", 0.1)
+    copy = fork(swallow)
+    for expected in ("started", "swallowed"):
+        assert copy.recv() == expected
+        copy.terminate()
+    time.sleep(0.2)
+    copy.terminate()
+    assert copy.join() == -signal.SIGTERM
 
 
 def test_a_run_on_a_full_disk_goes_on_when_there_is_room(program, fork, scene_file, tmp_path):

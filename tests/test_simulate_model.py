@@ -139,6 +139,7 @@ def test_a_hybrid_in_one_call_has_the_gate_that_it_is_given():
     scene, gate = pc.Scene.load(SCENE), pc.Gate(energy=1.0)
     for given, expected in ((True, pc.Gate()), (False, None), (None, None), (gate, gate)):
         assert pc.hybrid_of(scene, MODEL, gate=given).gate == expected
+    assert pc.hybrid_of(scene, pc.load_model(MODEL)).origin == {}
     for given in (1, "strict", {"corners": 0.0}):
         with pytest.raises(pc.errors.InputError, match="gate"):
             pc.hybrid_of(scene, MODEL, gate=given)
@@ -179,10 +180,6 @@ def test_a_quasi_static_scene_is_refused_unless_the_model_was_trained_on_such(
     own = LoadedModel(known.corrector, known.record.model_copy(update={"training": training}))
     assert (known.integrator, own.integrator) == ("backward-euler", "quasi-static")
     assert pc.hybrid_of(static, own).coarse.integrator == "quasi-static"
-
-
-def test_a_loaded_model_has_no_origin(learned):
-    assert pc.hybrid_of(pc.Scene.load(SCENE), pc.load_model(MODEL)).origin == {}
 
 
 def test_without_torch_the_extra_is_named(program, scene_file, tmp_path, monkeypatch):

@@ -613,6 +613,11 @@ def test_wrong_shapes_and_options_are_refused():
             pc.rollout(pc.ProjectiveDynamics(problem), **bad)
     with pytest.raises(InputError, match=r"problem is a Scene: expected pc.discretise"):
         pc.ProjectiveDynamics(problem.scene)
+    for stepper in (problem, problem.scene):
+        with pytest.raises(InputError, match="stepper is a"):
+            pc.rollout(stepper)
+    with pytest.raises(InputError, match="state is a ndarray"):
+        pc.ProjectiveDynamics(problem)(problem.positions)
     for forces in ({}, 1.0):
         with pytest.raises(InputError, match=r"forces is a \w+: expected an array"):
             pc.ProjectiveDynamics(problem)(problem.rest_state(), forces)

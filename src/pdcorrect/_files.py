@@ -10,7 +10,9 @@ import signal
 import socket
 import sys
 import threading
+import time
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -116,7 +118,8 @@ def _awaited(process: int) -> bool:
     return text.rpartition(")")[2].split()[:1] in (["Z"], ["X"])  # after the name in brackets
 
 
-_PAUSE = 0.01  # s
+_PAUSE, _CLOSING = 0.01, 1.0
+"""Before a lost signal is repeated, and for closing after a SIGTERM, s."""
 INTERRUPTED, TERMINATED = 130, 143
 """Exit status after Ctrl-C and after SIGTERM."""
 
@@ -127,7 +130,10 @@ class Terminated(BaseException):
 
 @contextlib.contextmanager
 def terminable() -> Iterator[None]:
-    """Raise `Terminated` in the main thread at the first SIGTERM; later ones are ignored."""
+    """Raise `Terminated` in the main thread at the first SIGTERM.
+
+    Others are ignored while files are closed, for a second; later ones end the process at once.
+    """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -161,8 +167,15 @@ def _silent(lost: Any) -> None:
 
 
 def _terminate(number: int, frame: FrameType | None) -> None:
-    signal.signal(number, signal.SIG_IGN)  # closing takes a moment; let nothing cut it short
+    signal.signal(number, partial(_again, time.monotonic()))
     raise Terminated
+
+
+def _again(first: float, number: int, frame: FrameType | None) -> None:
+    """End the process, unless it may still be closing: the first signal was lost, or that hangs."""
+    if time.monotonic() > first + _CLOSING:
+        signal.signal(number, signal.SIG_DFL)
+        signal.raise_signal(number)
 
 
 def _insist(lost: Any) -> None:
@@ -171,7 +184,7 @@ def _insist(lost: Any) -> None:
     Other errors in destructors after the signal are those of objects whose making it cut short.
     """
     if lost.exc_type is not Terminated:
-        if signal.getsignal(signal.SIGTERM) is not signal.SIG_IGN:
+        if signal.getsignal(signal.SIGTERM) is _terminate:
             sys.__unraisablehook__(lost)
         return
     signal.signal(signal.SIGTERM, _terminate)

@@ -23,13 +23,7 @@ from pdcorrect.cli.simulate import simulate
 from pdcorrect.cli.train import train, train_element, tune_element
 from pdcorrect.cli.validate import validate
 from pdcorrect.cli.view import view
-from pdcorrect.errors import (
-    EXTRAS,
-    ConvergenceError,
-    OutputError,
-    PdcorrectError,
-    PdcorrectWarning,
-)
+from pdcorrect.errors import EXTRAS, ConvergenceError, OutputError, PdcorrectError, PdcorrectWarning
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
 for command in (

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any, Optional
@@ -50,7 +51,7 @@ def render(
         raise InputError(f"--frame with {output.suffix}: a film shows all frames; leave it out.")
     check_new(output, overwrite=overwrite)
     number = -1 if frame is None else frame
-    view = _camera(camera)
+    view = _parsed("--camera", camera, _camera, "two angles, as 30,20")
     field: Any = None if colour is Colour.none else colour.value
     loaded = [load_trajectory(path) for path in runs]
     names = label or [path.stem for path in runs]
@@ -68,8 +69,8 @@ def render(
             fps=fps,
             camera=view,
             warp=warp,
-            section=_section(section),
-            size=_size(size),
+            section=_parsed("--section", section, _section, "an axis and a place, as x=0.02"),
+            size=_parsed("--size", size, _size, "WIDTHxHEIGHT, as 1200x800"),
         )
     say(f"wrote {output}")
 
@@ -84,32 +85,23 @@ def _refuse_with_overlay(**options: Any) -> None:
             )
 
 
-def _camera(text: str | None) -> Any:
-    """A name, or azimuth and elevation."""
-    if text is None or "," not in text:
-        return text
-    try:
-        azimuth, elevation = map(float, text.split(","))
-    except ValueError:
-        raise InputError(f"--camera {text}: expected two angles, as 30,20.") from None
-    return azimuth, elevation
+def _camera(text: str) -> Any:
+    return tuple(map(float, text.split(",", 1))) if "," in text else text
 
 
-def _section(text: str | None) -> tuple[str, float] | None:
-    if text is None:
-        return None
+def _section(text: str) -> tuple[str, float]:
     axis, _, place = text.partition("=")
-    try:
-        return axis.strip(), float(place)
-    except ValueError:
-        raise InputError(f"--section {text}: expected an axis and a place, as x=0.02.") from None
+    return axis.strip(), float(place)
 
 
-def _size(text: str | None) -> tuple[int, int] | None:
-    if text is None:
-        return None
-    try:
-        width, height = map(int, text.lower().split("x"))
-    except ValueError:
-        raise InputError(f"--size {text}: expected WIDTHxHEIGHT, as 1200x800.") from None
+def _size(text: str) -> tuple[int, int]:
+    width, height = map(int, text.lower().split("x"))
     return width, height
+
+
+def _parsed(option: str, text: str | None, parse: Callable[[str], Any], expected: str) -> Any:
+    """What an option says; `InputError` if it does not."""
+    try:
+        return None if text is None else parse(text)
+    except ValueError:
+        raise InputError(f"{option} {text}: expected {expected}.") from None

@@ -71,6 +71,8 @@ def simulate(
     if report:
         require_extra("pyvista", "view")
         require_extra("matplotlib", "view")
+    if output.exists() and output.samefile(scene):
+        raise InputError(f"{output}: is the scene: expected another name for the run.")
     _check_outputs(loaded, output, vtu, report, overwrite, resume)
     common.tell_of_compiling()
     stepper = _make_stepper(loaded, solver, refine, learned, model, gate)

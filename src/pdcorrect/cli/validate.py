@@ -15,8 +15,7 @@ from pdcorrect.cli.common import FAILED, OutputFolder, tell_of_compiling
 
 def validate(
     cases: Annotated[
-        Optional[list[str]],
-        typer.Argument(metavar="CASE", help="Names of cases; all by default."),
+        Optional[list[str]], typer.Argument(metavar="CASE", help="Names of cases; all by default.")
     ] = None,
     output: OutputFolder = Path("report"),
     quick: Annotated[bool, typer.Option("--quick", help="Only the quick parts.")] = False,

@@ -40,11 +40,7 @@ from pdcorrect.corrector.gate import (
     corrected_step,
     moved,
 )
-from pdcorrect.corrector.graph_replay import (
-    RecordedCorrector,
-    RecordedMeasures,
-    stored_and_ratios,
-)
+from pdcorrect.corrector.graph_replay import RecordedCorrector, RecordedMeasures, stored_and_ratios
 from pdcorrect.errors import InputError
 from pdcorrect.state import Status
 

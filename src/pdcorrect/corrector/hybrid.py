@@ -35,7 +35,7 @@ from pdcorrect.corrector.gate import (
 )
 from pdcorrect.corrector.model_io import LoadedModel, load_model, model_folder, weights_digest
 from pdcorrect.errors import InputError, PdcorrectWarning
-from pdcorrect.fem.problem import BASES, coarse_model
+from pdcorrect.fem.problem import BASES, Problem, coarse_model
 from pdcorrect.scene import Scene, check_scene
 from pdcorrect.solvers.implicit import ImplicitStepper
 from pdcorrect.solvers.projective import ProjectiveDynamics
@@ -109,16 +109,7 @@ class HybridStepper:
                 "ProjectiveDynamics(problem) or Newton(problem)."
             )
         self.coarse, self.problem = coarse_stepper, coarse_stepper.problem
-        substeps = self.problem.scene.time.substeps
-        if substeps > 1:
-            raise InputError(f"time.substeps = {substeps}: expected 1, frames are corrected whole.")
-        for found, what in (
-            (self.problem.contact, "obstacles, which a correction would enter"),
-            (self.problem.fibres, "actuators, which no model was trained with"),
-            (self.problem.rollers, "oblique rollers, which no model was trained with"),
-        ):
-            if found is not None:
-                raise InputError(f"the scene has {what}: expected none. Leave the model out.")
+        _check_fit(self.problem)
         self.corrector = check_corrector(corrector, torch.device("cpu"))
         check_velocity(velocity, coarse_stepper.integrator)
         check_gate(gate)
@@ -297,10 +288,7 @@ def _without(known: Known) -> Known:
 
 
 def hybrid_of(
-    scene: Scene,
-    model: str | Path | LoadedModel,
-    *,
-    gate: bool | Gate | None = True,
+    scene: Scene, model: str | Path | LoadedModel, *, gate: bool | Gate | None = True
 ) -> HybridStepper:
     """Projective dynamics on the coarse model that a corrector was trained for, corrected.
 
@@ -326,10 +314,11 @@ def hybrid_of(
     name = "the model" if isinstance(model, LoadedModel) else model_folder(model).name
     if loaded.base not in BASES:
         raise InputError(f"{name}: corrects {loaded.base!r}: expected one of {', '.join(BASES)}.")
-    _check_integrator(scene.time.integrator, loaded.integrator, name)
+    problem = coarse_model(scene, loaded.base)
+    _check_fit(problem, name, loaded.integrator)
     chosen: Gate | None = None if gate is False else Gate() if gate is True else gate
     return HybridStepper(
-        ProjectiveDynamics(coarse_model(scene, loaded.base)),
+        ProjectiveDynamics(problem),
         loaded.corrector,
         velocity=loaded.velocity,
         gate=chosen,
@@ -346,14 +335,32 @@ def about_model(model: str | Path, loaded: LoadedModel | None = None) -> dict[st
     }  # fmt: skip
 
 
-def _check_integrator(found: str, trained: str, name: str) -> None:
-    if found == trained:
-        return
-    told = f"{name}: trained on steps by {trained}, and the scene's time.integrator is {found!r}"
-    if found == "quasi-static":
+def _check_fit(problem: Problem, name: str = "corrector", trained: str | None = None) -> None:
+    """Refuse a scene that no model fits, with all reasons; ``trained`` is the model's integrator.
+
+    Another one is refused where it is quasi-static, or else warned of.
+    """
+    time, nodes = problem.scene.time, problem.cells.shape[1]
+    by, other = f"time.integrator = {time.integrator!r}", trained not in (None, time.integrator)
+    parts = {
+        "obstacles": problem.contact, "actuators": problem.fibres,
+        "oblique rollers": problem.rollers,
+    }  # fmt: skip
+    wrong = [f"{what}: expected none" for what, part in parts.items() if part is not None]
+    if nodes != 8:
+        wrong.append(f"cells with {nodes} nodes: expected 8, their corners")
+    if time.substeps > 1:
+        wrong.append(f"time.substeps = {time.substeps}: expected 1, as frames are corrected whole")
+    if other and time.integrator == "quasi-static":
+        wrong.append(f"{by}, which has no inertia: expected {trained!r}")
+    if wrong:
         raise InputError(
-            f"{told}, whose steps have no inertia: expected {trained!r}; set it in the scene, or "
-            "leave the model out."
+            f"{name}: the scene has {'; '.join(wrong)}. Change it, or leave the model out."
         )
-    change = f'set integrator = "{trained}" in [time], or leave the model out'
-    warnings.warn(f"{told}: it may be of no use; {change}", PdcorrectWarning, stacklevel=3)
+    if other:
+        warnings.warn(
+            f"{name}: trained on steps by {trained}, and the scene has {by}: it may be of no use; "
+            f'set integrator = "{trained}" in [time], or leave the model out',
+            PdcorrectWarning,
+            stacklevel=3,
+        )

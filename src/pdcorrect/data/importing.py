@@ -11,16 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, DTypeLike
 
 from pdcorrect.data.check_file import file_faults
-from pdcorrect.data.schema import (
-    BEST,
-    INTEGRATOR,
-    PLAIN,
-    REFERENCE,
-    Array,
-    Run,
-    Shard,
-    Simulation,
-)
+from pdcorrect.data.schema import BEST, INTEGRATOR, PLAIN, REFERENCE, Array, Run, Shard, Simulation
 from pdcorrect.data.simulate import unlike_arrays
 from pdcorrect.errors import InputError
 from pdcorrect.fem.graph import velocities

@@ -269,9 +269,7 @@ def _with(simulation: h5py.Group, name: str) -> frozenset[str]:
 
 
 def read_shard(
-    path: str | Path,
-    *,
-    runs: Collection[str] | Mapping[str, Collection[str]] | None = None,
+    path: str | Path, *, runs: Collection[str] | Mapping[str, Collection[str]] | None = None
 ) -> Shard:
     """Read a file of a data set, and find every changed byte by its checksum.
 

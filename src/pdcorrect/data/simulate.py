@@ -56,10 +56,7 @@ def models(config: DatasetConfig, mesh: MeshPlan) -> dict[str, Model]:
     best, converged = config.setting != "as-published", config.setting == "converged"
     divisor = CONVERGED_DIVISOR if converged else 1
     truth = partial(Model, best=best, truth=True)
-    found = {
-        REFERENCE: truth(mesh.refine, divisor=divisor),
-        PLAIN: Model(1, predict=not converged),
-    }
+    found = {REFERENCE: truth(mesh.refine, divisor=divisor), PLAIN: Model(1, predict=not converged)}
     if best:
         found[BEST] = Model(1, best=True, predict=not converged)
     else:

@@ -104,10 +104,7 @@ class DatasetInfo:
 
 
 def dataset_info(
-    folder: str | Path,
-    on_file: Callable[[Path], None] | None = None,
-    *,
-    skip_damaged: bool = False,
+    folder: str | Path, on_file: Callable[[Path], None] | None = None, *, skip_damaged: bool = False
 ) -> DatasetInfo:
     """Read a data set and summarise it; ``on_file`` is called with each file after it was read.
 

@@ -23,7 +23,7 @@ from pdcorrect.trajectory import Stepper, Trajectory
 
 CASE_BASES = ("plain", "enhanced", "learned", "best")
 """In the order of rows."""
-_27_NODES = "hex27"
+_27_NODES, _LEARNED = "hex27", "hex8-learned"
 _SECOND_ORDER = "generalised-alpha"
 
 
@@ -115,7 +115,7 @@ def cases_for(
     The reference is the fine mesh with the element of the best coarse model; with correctors, by
     name or folder, it is what they learned from, and the coarse models that they correct are among
     the cases.  A scene of 27-node elements, or of the best coarse model's own, has its own element
-    on the fine mesh.  The coarse run of a scene with the learned element is called so.
+    on the fine mesh.  The runs of a scene with the learned element are called so.
 
     ``gate`` is about correctors.  ``hex27`` and ``learned`` add elements on the coarse mesh;
     ``second_order`` adds the best coarse model and these by generalised-alpha, where the scene has
@@ -139,8 +139,8 @@ def cases_for(
                 "scene's 27-node elements have some: expected a scene of another element."
             )
         others += hybrids
-    if own == "hex8-learned":
-        others[others.index(CASES[2])] = replace(CASES[2], label=LEARNED.label)
+    if own == _LEARNED:
+        others = [replace(c, label=f"learned {c.label}") if c in CASES else c for c in others]
     elif learned:
         with_learned(scene)  # or a refusal before anything runs
         others.append(LEARNED)
@@ -188,10 +188,11 @@ class Row:
     ``relative_error`` is the one to the converged motion, see `metrics.relative_error`, and
     ``estimated_error`` the same to a finer run; None where that was not computed.  The other
     errors are node distances on the coarse nodes over all frames, against the reference case, in
-    metres; ``omega`` is eq. 7-2 with the first case on the coarse mesh as its zero.  Times are
-    medians for one frame; ``setup_seconds`` covers meshing, assembly and the first factorisation.
-    ``unusual_frames`` converged only by a fallback (see `Status`).  ``refused_frames`` are those
-    whose correction a gate refused; None without a corrector.
+    metres; ``omega`` is eq. 7-2, its zero the scene itself by PD on the coarse mesh, or the best
+    coarse model where that is a learned one.  Times are medians for one frame; ``setup_seconds``
+    covers meshing, assembly and the first factorisation.  ``unusual_frames`` converged only by a
+    fallback (see `Status`).  ``refused_frames`` are those whose correction a gate refused; None
+    without a corrector.
     """
 
     label: str
@@ -344,7 +345,9 @@ def compare(
         runs[case.label], on_coarse[case.label] = run, restrict(run, to=coarse)
     truth = on_coarse[cases[0].label]
     complete = tuple(case for case in cases if case.label in runs)
-    base = next((on_coarse[c.label] for c in complete[::-1] if c.plain and c.solver == "pd"), None)
+    zero = _BEST if scene.solver.element == _LEARNED else CASES[2]
+    own = (on_coarse[c.label] for c in complete if replace(c, label=zero.label) == zero)
+    base = next(own, None)
     nearer = None if finer is None else restrict(finer, to=coarse)
     rows = []
     for case in sorted(complete, key=_coarse_to_fine):

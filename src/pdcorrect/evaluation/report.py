@@ -42,8 +42,7 @@ def table(comparison: Comparison) -> list[dict[str, str]]:
     """The comparison as rows of text by heading; the first error is that which is asked for.
 
     "error" is relative and to the converged motion, "estimated" the same to a finer run; others
-    are from the reference.  "corrected" is the share of the scene's own coarse PD run's squared
-    error that is gone.
+    are from the reference.  "corrected" is `Row.omega`, the share of a squared error that is gone.
     """
     by_label = {row.label: row for row in comparison.rows}
     reference = by_label[comparison.reference]

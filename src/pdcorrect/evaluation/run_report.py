@@ -7,6 +7,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from pdcorrect import figures
 from pdcorrect._files import make_folder
 from pdcorrect.evaluation.page import PAGE, write_page
@@ -36,7 +38,8 @@ _LOST = 0.2
 
 def summary(stats: Mapping[str, Any], stepper: Stepper, resumed: int = 0) -> list[str]:
     """Frames, time, iterations, energy, and what is unusual about a run, one sentence each."""
-    count, seconds = len(stats["seconds"]), stats["seconds"].sum()
+    seconds = stats["seconds"]  # the first frame may load kernels: hence the median
+    count = len(seconds)
     problem, status = stepper.problem, stats["status"].tolist()
     ends = ", ".join(f"{status.count(name)} {name.lower()}" for name in dict.fromkeys(status))
     ran = f"{count} frames ({resumed} resumed)" if resumed else f"{count} frames"
@@ -48,7 +51,7 @@ def summary(stats: Mapping[str, Any], stepper: Stepper, resumed: int = 0) -> lis
     found = [
         f"{ran} of {problem.scene.time.step:g} s on {len(problem.positions)} nodes "
         f"and {len(problem.cells)} cells ({element}, {problem.mass_rule} mass) in "
-        f"{seconds:.2f} s: {three_digits(1e3 * seconds / count)} ms a frame",
+        f"{seconds.sum():.2f} s: median {three_digits(1e3 * np.median(seconds))} ms a frame",
         f"iterations a frame: mean {stats['iterations'].mean():.1f}, most "
         f"{stats['iterations'].max()}; frames: {ends}",
         f"energy at the end: elastic {stats['elastic_energy'][-1]:.4g} J, kinetic "

@@ -150,12 +150,6 @@ class Touching:
         return out if project else out - self.force[:, None, None] * self.curvatures
 
 
-_NOTHING = Touching(
-    np.zeros(0, dtype=np.int64), 0.0, np.zeros(0), np.zeros(0), np.zeros((0, 3)),
-    np.zeros((0, 3, 3)),
-)  # fmt: skip
-
-
 class Contact:
     """A body's surface and all obstacles of its scene.
 
@@ -240,10 +234,7 @@ class Contact:
         out = []
         for obstacle, D, k in zip(self.obstacles, self.distances, self.stiffnesses, strict=True):
             gaps = obstacle.gaps(x, time)
-            points = np.flatnonzero(gaps < D)
-            if not len(points):
-                out.append(_NOTHING)
-                continue
+            points = np.flatnonzero(gaps < D)  # without any the kernels are run, so loaded, too
             areas = self.points.areas[points]
             value, first, second = barrier(gaps[points] / D)
             normals, curvatures = obstacle.derivatives(x[points], time)

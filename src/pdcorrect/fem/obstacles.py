@@ -115,13 +115,12 @@ def _gaps(table, R, b, x):  # type: ignore[no-untyped-def]
 
 @njit(**OPTIONS)
 def _derivatives(table, R, b, x):  # type: ignore[no-untyped-def]
-    """First (n, 3) and second (n, 3, 3) derivatives of the gaps of points x (n, 3) outside."""
-    X, g, n, H = np.empty(3), np.empty(3), np.empty(3), np.empty((3, 3))
-    first, second = np.empty((len(x), 3)), np.empty((len(x), 3, 3))
+    """First and second derivatives (n, 3), (n, 3, 3) by X of the gaps of points x (n, 3)."""
+    X, g = np.empty(3), np.empty(3)
+    first, second = np.zeros((len(x), 3)), np.zeros((len(x), 3, 3))
     for p in range(len(x)):
         _local(x[p], R, b, X)
-        n[:] = 0.0
-        H[:] = 0.0
+        n, H = first[p], second[p]
         square, several = 0.0, len(table) > 1
         for row in table:
             q, bend = _coordinate(row, X, g)
@@ -142,8 +141,6 @@ def _derivatives(table, R, b, x):  # type: ignore[no-untyped-def]
             for i in range(3):
                 for j in range(3):
                     H[i, j] -= n[i] * n[j] / d
-        first[p] = R @ n
-        second[p] = R @ H @ R.T
     return first, second
 
 
@@ -211,8 +208,9 @@ class RigidObstacle:
 
         Not numbers inside.
         """
-        first, second = _derivatives(self._table, *self.frame(time), x)
-        return first, second
+        R, b = self.frame(time)
+        first, second = _derivatives(self._table, R, b, x)
+        return first @ R.T, R @ second @ R.T
 
     def first_hit(self, x: Array, way: Array, time: float) -> float:
         """The share of the paths x + share way at which a point enters; infinite if none does."""

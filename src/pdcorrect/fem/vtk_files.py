@@ -152,7 +152,8 @@ def _by_vtk(path: Path, pieces: list[tuple[int, int]], reason: str) -> Content:
         )
     with tempfile.TemporaryDirectory() as folder:
         target = Path(folder) / "grid.npz"
-        command = [sys.executable, "-m", "pdcorrect.fem.vtk_process", str(path), str(target)]
+        given = str(path), str(target), _VALUE
+        command = [sys.executable, "-m", "pdcorrect.fem.vtk_process", *given]
         done = subprocess.run(command, capture_output=True, text=True, errors="replace")
         if done.returncode != 0:
             *_, last = ["it ended", *done.stderr.split("\n")[-2:-1]]

@@ -1,6 +1,6 @@
-"""``python -m pdcorrect.fem.vtk_process FILE TARGET``: VTK reads a file, in a process of its own.
+"""``python -m pdcorrect.fem.vtk_process FILE TARGET PREFIX``: VTK reads a file.
 
-It imports only what it needs of VTK, and so starts sooner than with pyvista.
+In a process of its own, which imports only what it needs of VTK and so starts sooner than pyvista.
 """
 
 from __future__ import annotations
@@ -15,9 +15,6 @@ from vtkmodules import vtkIOLegacy, vtkIOXML
 from vtkmodules.util.numpy_support import vtk_to_numpy
 from vtkmodules.vtkCommonCore import vtkObject
 from vtkmodules.vtkCommonDataModel import vtkGenericCell, vtkUnstructuredGrid
-
-VALUE = "value "
-"""Before the names of arrays of cells, which may be any."""
 
 _READERS = {
     ".vtu": vtkIOXML.vtkXMLUnstructuredGridReader, ".pvtu": vtkIOXML.vtkXMLPUnstructuredGridReader,
@@ -49,8 +46,8 @@ def _read(path: str) -> Any:
     return turned.GetOutput()
 
 
-def write_grid(path: str, target: str) -> None:
-    """Write points, cells and whole numbers of a file's cells as NumPy arrays."""
+def write_grid(path: str, target: str, prefix: str) -> None:
+    """Write points, cells and, by names behind a prefix, whole numbers of cells as NumPy arrays."""
     vtkObject.SetGlobalWarningDisplay(0)  # damaged files make VTK print pages
     grid = _read(path)
     count = grid.GetNumberOfCells()
@@ -63,7 +60,7 @@ def write_grid(path: str, target: str) -> None:
         dimensions.append(cell.GetCellDimension() if cell else 0)
     data, table = grid.GetCellData(), grid.GetCells()
     values = {
-        VALUE + (data.GetArrayName(k) or ""): vtk_to_numpy(data.GetArray(k))  # type: ignore[no-untyped-call]
+        prefix + (data.GetArrayName(k) or ""): vtk_to_numpy(data.GetArray(k))  # type: ignore[no-untyped-call]
         for k in range(data.GetNumberOfArrays())
         if data.GetArray(k) is not None  # as text
     }

@@ -231,9 +231,10 @@ def render_overlay(
     (place,) = _choose(frame, shared.shape[1], film=False)
     coarsest = min(runs, key=lambda run: len(run.points))
     bodies = [
-        Body(on_nodes_of(run, coarsest), frames[[place]], None, obstacles_of(run))
+        Body(on_nodes_of(run, coarsest), frames[[place]], None)
         for run, frames in zip(runs, shared, strict=True)
     ]
+    bodies[0] = replace(bodies[0], obstacles=obstacles_of(runs[0]))
     points, colours = shown_points(bodies, rest=False), _OVERLAID[: len(runs)]
     view = Camera.fitted(points, window, camera_axes(camera))
     time = float(runs[0].times[shared[0, place]])

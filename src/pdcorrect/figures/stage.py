@@ -6,13 +6,7 @@ import numpy as np
 
 from pdcorrect.figures.fields import Colour, body_of, scaled
 from pdcorrect.figures.obstacles import obstacles_of
-from pdcorrect.figures.panels import (
-    OBSTACLE,
-    Body,
-    camera_axes,
-    obstacle_surfaces,
-    quiet_pyvista,
-)
+from pdcorrect.figures.panels import OBSTACLE, Body, camera_axes, obstacle_surfaces, quiet_pyvista
 from pdcorrect.trajectory import Trajectory
 
 

@@ -223,8 +223,9 @@ def _read(path: Path) -> NDArray[Any]:
         array = np.load(path, allow_pickle=False, mmap_mode="r")
         shape, kind = array.shape, array.dtype.kind
     except Exception as error:  # NumPy raises nearly every type on damaged bytes
+        told = getattr(error, "strerror", None) or error
         raise SceneError(
-            f"body.occupancy = {str(path)!r} cannot be read ({error}): expected a NumPy file, .npy."
+            f"body.occupancy = {str(path)!r} cannot be read ({told}): expected a NumPy file, .npy."
         ) from None
     if len(shape) != 3 or kind not in "biu":
         raise SceneError(

@@ -187,7 +187,10 @@ class ImplicitStepper:
             rest = self.problem.rest_state()
             objective = self.objective(rest, None, self.time_step)
             objective.value_and_gradient(objective.start)
-            objective.hessian_operator(objective.start)(objective.start)
+            hessian = objective.hessian_operator(objective.start)
+            hessian(objective.start)
+            if objective.contact is not None:
+                hessian.blocks()  # of steps that touch
             self._prepare(objective)
         return self
 

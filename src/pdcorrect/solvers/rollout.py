@@ -150,6 +150,10 @@ def rollout(
     InputError
         If an argument, or what ``forces`` returns, has a wrong shape or value.
     """
+    if not hasattr(stepper, "problem"):
+        raise InputError(
+            f"stepper is a {type(stepper).__name__}: expected pc.ProjectiveDynamics(problem)."
+        )
     states = [stepper.problem.initial_state() if state is None else state]
     log = StepLog()
     steps = march(stepper, frames, state=states[0], forces=forces, on_failure=on_failure)

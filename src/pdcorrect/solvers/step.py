@@ -328,6 +328,8 @@ class GlobalSolver:
 
 def check_input(problem: Problem, state: State, forces: Array | None) -> None:
     """Refuse states and forces of the wrong shape or with NaN, see `nodal_array`."""
+    if not isinstance(state, State):
+        raise InputError(f"state is a {type(state).__name__}: expected problem.initial_state().")
     nodal_array(problem, "positions", state.positions)
     nodal_array(problem, "velocities", state.velocities)
     if forces is not None:

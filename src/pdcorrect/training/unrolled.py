@@ -126,11 +126,7 @@ class UnrolledBatches:
 
 
 def unroll(
-    group: SceneGroup,
-    corrector: Corrector,
-    start: Rollouts,
-    steps: int,
-    stage: Stage,
+    group: SceneGroup, corrector: Corrector, start: Rollouts, steps: int, stage: Stage
 ) -> Unrolled:
     """Step a group and compare each frame with the reference."""
     layer = group.layer(corrector, stage.through_solver)
