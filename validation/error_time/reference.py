@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -28,10 +29,11 @@ _MEMORY = "memory."
 def of_scene(label: str, scene: pc.Scene) -> common.Outcome:
     """A scene's row; what is computed is kept on disk, and goes on where it was ended."""
     motion = pc.converged(scene)
-    at = converged.REFINE, converged.DIVISOR
 
-    def run_of(*place: int) -> Any:
-        return motion.positions if place == at else positions(scene, *place)
+    def run_of(refine: int, divisor: int) -> pc.Trajectory:
+        if (refine, divisor) == (converged.REFINE, converged.DIVISOR):
+            return motion
+        return replace(motion, positions=positions(scene, refine, divisor))
 
     found, meshes = converged.own_errors(scene, len(motion.cells), run_of)
     spent = [found[name] for name in (converged.TIME_ERROR, converged.MESH_ERROR)]

@@ -65,9 +65,9 @@ def share_of(found: Timed, motion: pc.Trajectory) -> float:
     return estimate / pc.metrics.relative_error(found.run, motion) / size(motion)
 
 
-def rounded(value: float) -> float:
-    """A time to four digits."""
-    return float(f"{value:.4g}")
+def rounded(value: float, digits: int = 4) -> float:
+    """A time to so many digits."""
+    return float(f"{value:.{digits}g}")
 
 
 KINDS: dict[str, Callable[[Timed], float]] = {
@@ -96,15 +96,14 @@ def of_scene(label: str, scene: pc.Scene, methods: Collection[str] = METHODS) ->
     figures = {f"{label}, {p.name}, %": p.error for p in points if p.name in ESTIMATED}
     head = ("scene", "nodes", "RMS displacement, mm")
     about = (label, float(len(motion.points)), 1e3 * size(motion))
-    rows = tuple(
-        (label, float(scene.time.frames), kind,
-         *(rounded(of(found[name])) if found[name].run else math.nan for name in methods))
-        for kind, of in KINDS.items()
-    )  # fmt: skip
+    rows: list[tuple[float | str, ...]] = []
+    for kind, of in KINDS.items():
+        told = (rounded(of(x), 3) if x.run else math.nan for x in found.values())
+        rows.append((label, float(scene.time.frames), kind, *told))
     tables = (
         common.Table(ERRORS, (*head, *methods), ((*about, *(p.error for p in points)),)),
         common.Table(TIMES, ("scene", *methods), ((label, *(p.time for p in points)),)),
-        common.Table(ROUNDS, ("scene", "frames", "what", *methods), rows),
+        common.Table(ROUNDS, ("scene", "frames", "what", *methods), tuple(rows)),
         common.Table(SHARES, ("scene", *ESTIMATED), ((label, *shares),)),
     )
     return common.Outcome(figures, tables)
@@ -115,11 +114,11 @@ def parts(quick: bool) -> dict[str, Callable[[], common.Outcome]]:
     if quick:
         scene = SCENES[QUICK].with_changes(time=FEW)
         return {QUICK: partial(of_scene, QUICK, scene, ESTIMATED)}
-    known = scenes()
-    return {name: partial(of_scene, name, scene) for name, scene in known.items()} | {
-        f"converged motion of {name}": partial(reference.of_scene, name, scene)
-        for name, scene in known.items()
-    }
+    found: dict[str, Callable[[], common.Outcome]] = {}
+    for name, scene in scenes().items():
+        found[name] = partial(of_scene, name, scene)
+        found[f"converged motion of {name}"] = partial(reference.of_scene, name, scene)
+    return found
 
 
 def summary(record: common.Record) -> common.Outcome:

@@ -188,8 +188,9 @@ def own_errors(
 def _own_error(scene: Scene, run: Trajectory, on_step: OnRun | None) -> dict[str, str]:
     """`own_errors` as attributes."""
 
-    def run_of(*place: int) -> Trajectory:
-        return run if place == (REFINE, DIVISOR) else _computed(scene, *place, on_step)
+    def run_of(refine: int, divisor: int) -> Trajectory:
+        known = (refine, divisor) == (REFINE, DIVISOR)
+        return run if known else _computed(scene, refine, divisor, on_step)
 
     found, meshes = own_errors(scene, len(run.cells), run_of)
     shares = {name: f"{share:.3g}" for name, (share, _) in found.items()}
