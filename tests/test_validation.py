@@ -94,7 +94,8 @@ def test_every_case_has_a_question_and_inputs_that_exist(name):
 
 def test_fronts_are_interpolated_by_logarithms_and_end():
     run = CASES["error_time"].module
-    points = [run.Point(n, t, e) for n, t, e in (("a", 1, 16), ("b", 4, 1), ("far", 2, 20))]
+    point = sys.modules["methods"].Point
+    points = [point(n, t, e) for n, t, e in (("a", 1, 16), ("b", 4, 1), ("far", 2, 20))]
     assert [point.name for point in run.front(points)] == ["a", "b"]
     assert run.time_at(4.0, points) == pytest.approx(2.0)
     assert run.error_at(2.0, points) == pytest.approx(4.0)
@@ -178,20 +179,51 @@ class Resting:
         return {"method": "rest"}
 
 
-def test_dear_methods_have_fewer_rounds_and_failures_have_none(monkeypatch):
+def test_dear_methods_have_fewer_rounds_and_failures_have_none(monkeypatch, tmp_path):
     run = CASES["error_time"].module
-    rounds = sys.modules["rounds"]
-    monkeypatch.setattr(rounds, "ROUNDS", ((20.0, 3), (math.inf, 1)))
+    monkeypatch.setattr(sys.modules["rounds"], "ROUNDS", ((20.0, 3), (math.inf, 1)))
     scene = beam((1, 1, 1), time={"frames": 2})
     methods = {"cheap": Sleeper(0.001), "dear": Sleeper(0.03), "fails": Sleeper(0.0, 0.015)}
-    found = run.timed(scene, methods)
-    assert [found[name].wants() for name in methods] == [3, 1, 0]
+    judged = []
+
+    def judge(name, trajectory):
+        judged.append(name)
+        return {"frames": len(trajectory)}
+
+    found = run.timed(scene, methods, judge, tmp_path / "rounds")
+    assert [each.wants() for each in found.values()] == [3, 1, 0]
     assert [method.made for method in methods.values()] == [4, 2, 2]  # one not timed
-    assert [len(found[name].wall) for name in methods] == [3, 1, 0]
+    assert [len(each.wall) for each in found.values()] == [3, 1, 0]
+    assert judged == ["cheap", "dear"]
+    assert found["dear"].found == {"frames": 2}
     assert min(found["cheap"].wall) >= 1.0
     assert min(found["dear"].first) >= 0.03
     assert max(found["dear"].cpu) < 20.0  # it rests
-    assert math.isnan(run.point_of("fails", found["fails"], None).time)
+    assert not list(tmp_path.iterdir())
+
+
+def test_rounds_go_on_where_they_were_ended(monkeypatch, tmp_path):
+    run = CASES["error_time"].module
+    monkeypatch.setattr(sys.modules["rounds"], "ROUNDS", ((math.inf, 3),))
+    scene = beam((1, 1, 1), time={"frames": 2})
+    methods = {"a": Sleeper(0.001), "b": Sleeper(0.001)}
+    real = Sleeper.stepper
+
+    def stopping(self, scene):
+        if self.made == 3:
+            raise KeyboardInterrupt
+        return real(self, scene)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Sleeper, "stepper", stopping)
+        with pytest.raises(KeyboardInterrupt):
+            run.timed(scene, methods, lambda *_: {"error": 1.0}, tmp_path / "rounds")
+    assert [method.made for method in methods.values()] == [3, 3]  # two rounds of each
+    found = run.timed(scene, methods, None, tmp_path / "rounds")
+    assert [len(each.wall) for each in found.values()] == [3, 3]
+    assert found["b"].found == {"error": 1.0}
+    assert [method.made for method in methods.values()] == [5, 5]
+    assert not list(tmp_path.iterdir())
 
 
 def test_levels_go_on_where_they_were_ended(tmp_path, monkeypatch):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import math
 import warnings
 from collections.abc import Callable, Collection
@@ -21,7 +23,6 @@ from methods import (
     RIVALS,
     ROUNDS,
     TIMES,
-    Point,
     error_at,
     front,
     points_of,
@@ -30,7 +31,10 @@ from methods import (
 from rounds import Timed, timed
 
 import pdcorrect as pc
+from pdcorrect._environment import cache_folder, code_digest, environment
+from pdcorrect._files import make_folder
 from pdcorrect.errors import PdcorrectWarning
+from pdcorrect.evaluation.converged import cache_key
 
 QUICK, FEW = "cantilever", {"frames": 8}
 """Scene and frames of a quick run, which has the methods of `ESTIMATED` only."""
@@ -46,23 +50,6 @@ TIGHT, NEWTON = "best coarse, 1, tolerance / 10", "best coarse, 1, Newton"
 QUICKER, NEARER = "speed-up at equal error", "error of the front at equal time over its own"
 LOST = 100.0
 """Error, %, of runs that fail."""
-
-
-def point_of(name: str, found: Timed, motion: pc.Trajectory) -> Point:
-    """A method's least time and its error."""
-    if found.run is None:
-        return Point(name, math.nan, LOST)
-    return Point(
-        name, rounded(min(found.wall)), 100.0 * pc.metrics.relative_error(found.run, motion)
-    )
-
-
-def share_of(found: Timed, motion: pc.Trajectory) -> float:
-    """The estimated over the true error."""
-    if found.run is None:
-        return math.nan
-    estimate = float(np.sqrt((pc.error_estimate(found.run)[1:] ** 2).mean()))
-    return estimate / pc.metrics.relative_error(found.run, motion) / size(motion)
 
 
 def rounded(value: float, digits: int = 4) -> float:
@@ -86,27 +73,42 @@ def size(motion: pc.Trajectory) -> float:
 
 
 def of_scene(label: str, scene: pc.Scene, methods: Collection[str] = METHODS) -> common.Outcome:
-    """By all methods; converged motions are kept on disk."""
+    """By all methods; converged motions are kept on disk, and rounds until all are done."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", PdcorrectWarning)
         motion = pc.converged(scene)
-        found = timed(scene, {name: METHODS[name] for name in methods})
-        points = [point_of(name, found[name], motion) for name in methods]
-        shares = [share_of(found[name], motion) for name in ESTIMATED]
-    figures = {f"{label}, {p.name}, %": p.error for p in points if p.name in ESTIMATED}
-    head = ("scene", "nodes", "RMS displacement, mm")
-    about = (label, float(len(motion.points)), 1e3 * size(motion))
+        extent = size(motion)
+
+        def judge(name: str, run: pc.Trajectory) -> dict[str, float]:
+            error = pc.metrics.relative_error(run, motion)
+            if name not in ESTIMATED:
+                return {"error": 100.0 * error}
+            estimate = float(np.sqrt((pc.error_estimate(run)[1:] ** 2).mean()))
+            return {"error": 100.0 * error, "share": estimate / error / extent}
+
+        found = timed(scene, {name: METHODS[name] for name in methods}, judge, kept(scene, methods))
+    errors = {name: x.found.get("error", LOST) for name, x in found.items()}
     rows: list[tuple[float | str, ...]] = []
     for kind, of in KINDS.items():
-        told = (rounded(of(x), 3) if x.run else math.nan for x in found.values())
+        told = (math.nan if x.failed else rounded(of(x), 3) for x in found.values())
         rows.append((label, float(scene.time.frames), kind, *told))
+    times = (math.nan if x.failed else rounded(min(x.wall)) for x in found.values())
+    shares = (found[name].found.get("share", math.nan) for name in ESTIMATED)
+    head, about = ("nodes", "RMS displacement, mm"), (float(len(motion.points)), 1e3 * extent)
     tables = (
-        common.Table(ERRORS, (*head, *methods), ((*about, *(p.error for p in points)),)),
-        common.Table(TIMES, ("scene", *methods), ((label, *(p.time for p in points)),)),
+        common.Table(ERRORS, ("scene", *head, *methods), ((label, *about, *errors.values()),)),
+        common.Table(TIMES, ("scene", *methods), ((label, *times),)),
         common.Table(ROUNDS, ("scene", "frames", "what", *methods), tuple(rows)),
         common.Table(SHARES, ("scene", *ESTIMATED), ((label, *shares),)),
     )
-    return common.Outcome(figures, tables)
+    return common.Outcome({f"{label}, {name}, %": errors[name] for name in ESTIMATED}, tables)
+
+
+def kept(scene: pc.Scene, methods: Collection[str]) -> Path:
+    """Where rounds of this machine and code are kept."""
+    about = cache_key(scene), code_digest(), environment(), list(methods)
+    name = hashlib.sha256(json.dumps(about).encode()).hexdigest()
+    return make_folder(cache_folder("rounds")) / f"{name}.json"
 
 
 def parts(quick: bool) -> dict[str, Callable[[], common.Outcome]]:
