@@ -23,10 +23,13 @@ QUICK = [name for name, case in CASES.items() if case.has_quick_part]
 
 def check(name, quick):
     """All figures expected of the run are there, and none is outside."""
-    figures = {}
+    record, module = harness.Record("", quick), CASES[name].module
     for part in CASES[name].parts(quick).values():
-        figures |= part().figures
-    assert outside(figures, CASES[name].expected, quick) == []
+        outcome = part()
+        record.add(outcome.figures, [vars(table) for table in outcome.tables])
+    if hasattr(module, "summary") and not quick:
+        record.add(module.summary(record).figures, ())
+    assert outside(record.figures, CASES[name].expected, quick) == []
 
 
 COVERED = {
