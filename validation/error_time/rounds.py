@@ -14,7 +14,7 @@ import pdcorrect as pc
 from pdcorrect._files import write_text
 from pdcorrect.errors import ConvergenceError
 
-ROUNDS = ((150.0, 5), (400.0, 2), (math.inf, 1))
+ROUNDS = ((40.0, 5), (150.0, 3), (math.inf, 1))
 """Rounds of methods whose first one takes at most so many ms a frame."""
 MOST = max(count for _, count in ROUNDS)
 
