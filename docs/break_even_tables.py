@@ -13,8 +13,8 @@ from records import RECORDS, ROOT, Rows, read
 
 sys.path += [str(ROOT / "validation"), str(ROOT / "validation" / "error_time")]
 import harness
-from break_even import Repaid, repaid
-from methods import CORRECTORS, points_of
+from break_even import Repaid, repaid, simulations_of
+from methods import CORRECTORS
 
 LEARNED = ("learned, 1", "learned, 2", "learned, 4")
 STUDY = "4000 bodies"
@@ -71,18 +71,17 @@ def costs() -> Rows:
 
 def break_even() -> Rows:
     """Simulations that repay data and training: over all scenes, of correctors in their own."""
-    measured = read(RECORDS / "break_even.json")
     record = harness.load(RECORDS / "error_time.json")
     assert record is not None
-    points = points_of(record)
+    reached = simulations_of(record)
     data, gpu, cpu = element_seconds()
-    rows = [_row(name, repaid(name, data + gpu, points, measured)) for name in LEARNED]
-    on_cpu = repaid(LEARNED[1], data + cpu, points, measured)
+    rows = [_row(name, repaid(name, data + gpu, reached)) for name in LEARNED]
+    on_cpu = repaid(LEARNED[1], data + cpu, reached)
     rows.append(_row(f"{LEARNED[1]}, trained on a CPU", on_cpu))
     for model in CORRECTORS:
         *spent, _ = corrector_seconds(model)
         name, own = f"hybrid {model}", model.partition("-")[0]
-        rows.append(_row(name, repaid(name, sum(spent), {own: points[own]}, measured)))
+        rows.append(_row(name, repaid(name, sum(spent), {own: reached[own]})))
     head = ("run, steps a frame", "scenes", "beside the front: median", "least", "never",
             "hex27, as many steps, by time (as near)", "4×4×4, by time (as near)")  # fmt: skip
     return head, rows

@@ -20,6 +20,7 @@ SHORT = (
     "hex27, 1", "best on 4x4x4, 1",
 )  # fmt: skip
 """Of the same, for the README."""
+OWN = "Errors of the converged motions, %"
 FREQUENCIES = "Error of the lowest 10 frequencies, %"
 
 
@@ -85,6 +86,13 @@ def beside_the_front() -> Rows:
     return ("run", *(f"{what}, {kind}" for what in heads[2:] for kind in kinds)), cells
 
 
+def converged_errors() -> Rows:
+    """The converged motions' own errors, % of the motion, and the orders seen."""
+    heads, rows = table_of("error_time", OWN)
+    cells = [[row[0], *(number(x, 2) for x in row[1:5]), row[5]] for row in rows]
+    return heads, cells
+
+
 def unlike_families() -> Rows:
     """Errors over the forty scenes, %, and median times, ms, a row a run."""
     heads, rows = table_of("unlike_families", "Errors, % of the RMS displacement")
@@ -131,6 +139,7 @@ def tables() -> Iterator[tuple[str, Callable[[], Rows]]]:
     yield "turek-hron-swing", partial(as_measured, "turek_hron", "CSM3", 4)
     yield "tapered-membrane", partial(as_measured, "tapered_membrane", "Frequencies", 5)
     yield "error-time-all", error_time
+    yield "converged-errors", converged_errors
     yield "error-time", partial(error_time, CHOICE)
     yield "error-time-short", partial(error_time, SHORT)
     yield "beside-the-front", beside_the_front

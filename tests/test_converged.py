@@ -83,21 +83,47 @@ def test_quasi_static_scenes_are_not_refined_in_time(computed):
     assert 0 < float(run.attributes[module.MESH_ERROR]) < 0.1
 
 
-def test_its_own_error_is_an_upper_estimate_that_shrinks(scene, computed, monkeypatch):
+@pytest.mark.parametrize("levels", [(2, 4, 8), (2, 4, 6), (1, 3, 4)])
+@pytest.mark.parametrize("order", [0.5, 1.0, 1.6, 2.0])
+def test_errors_of_one_power_are_found_with_their_order(levels, order):
+    truth, error = np.zeros((3, 2, 3)), np.ones((3, 2, 3))
+    truth[1:], error[0] = 2.0, 0.0
+    runs = {n: truth + error * n**-order for n in levels}
+    share, found = module.richardson(runs, 4)
+    assert found == pytest.approx(order)
+    size = 2.0 + levels[-1] ** -order  # of the finest
+    assert share == pytest.approx(4**-order / size)
+
+
+def test_orders_outside_theory_are_not_believed():
+    truth, error = np.zeros((2, 1, 3)), np.ones((2, 1, 3))
+    truth[1], error[0] = 1.0, 0.0
+    quick = {n: truth + error * n**-6.0 for n in (2, 4, 8)}
+    share, order = module.richardson(quick, 4)
+    assert order == 2.0
+    assert share > pc.metrics.relative_error(quick[4], truth)
+    slow = {n: truth + error * n**-0.1 for n in (2, 4, 8)}
+    assert module.richardson(slow, 4)[1] == 0.5
+    apart = {2: truth, 4: truth + 0.1 * error, 8: truth}
+    assert module.richardson(apart, 4)[1] == 0.5
+    assert module.richardson(dict.fromkeys((2, 4, 8), truth), 4) == (0.0, 2.0)
+
+
+def test_its_own_error_is_near_the_true_one_and_shrinks(scene, computed, monkeypatch):
     run = pc.converged(scene, error=True)
-    assert computed == [(4, 4), (4, 8), (8, 4)]
+    assert computed == [(4, 4), (4, 2), (4, 8), (2, 4), (8, 4)]
     time, mesh = (float(run.attributes[key]) for key in (module.TIME_ERROR, module.MESH_ERROR))
-    assert run.attributes[module.MESH_CHECK] == "8x8x8 cells"
-    truth = module._computed(scene, 4, 32, None)
-    assert pc.metrics.relative_error(run, truth) < time < 0.05
-    assert mesh < 0.05
+    assert run.attributes[module.MESH_LEVELS] == "2, 4, 8"
+    true = pc.metrics.relative_error(run, module._computed(scene, 4, 32, None))
+    assert 0.9 * true < time < 1.5 * true
+    assert 0.0 < mesh < 0.05
     monkeypatch.setattr(module, "_MOST_CELLS", 1)
     coarser = module._own_error(scene, run, None)
-    assert coarser[module.MESH_CHECK] == "2x2x2 cells"
-    assert float(coarser[module.MESH_ERROR]) > mesh / 2
+    assert coarser[module.MESH_LEVELS] == "1, 2, 4"
+    assert mesh < float(coarser[module.MESH_ERROR]) < 3.0 * mesh  # of no order that is seen
     monkeypatch.setattr(module, "DIVISOR", 8)
     half = module._own_error(scene, module._computed(scene, 4, 8, None), None)
-    assert float(half[module.TIME_ERROR]) < 0.6 * time
+    assert float(half[module.TIME_ERROR]) < 0.4 * time
 
 
 def test_the_cache_is_hit_by_the_same_scene_only(scene, computed, cache, tmp_path):
@@ -121,10 +147,10 @@ def test_an_error_is_added_to_a_kept_run_and_kept(scene, computed):
     assert module.MESH_ERROR not in first.attributes
     again = pc.converged(scene, error=True)
     assert same(again, first)
-    assert computed == [(4, 4), (4, 8), (8, 4)]
+    assert computed == [(4, 4), (4, 2), (4, 8), (2, 4), (8, 4)]
     assert pc.converged(scene, error=True).attributes == again.attributes
     assert pc.converged(scene).attributes == again.attributes
-    assert len(computed) == 3
+    assert len(computed) == 5
 
 
 def test_what_a_mesh_file_holds_counts_and_not_its_name(tmp_path, computed):
@@ -159,12 +185,12 @@ def test_what_an_included_file_holds_counts(tmp_path):
         **beam().model_dump(by_alias=True, exclude_none=True)
         | {"body": {"shape": "file", "path": str(tmp_path / "a.inp")}}
     )
-    first = module._key(scene)
-    assert module._key(scene) == first
+    first = module.cache_key(scene)
+    assert module.cache_key(scene) == first
     (tmp_path / "a.inp").write_text(text + "\n*NSET, NSET=Held\n1, 2\n")
-    second = module._key(scene)
+    second = module.cache_key(scene)
     (tmp_path / "nodes.txt").write_text("\n".join(lines).replace("0.02", "0.03"))
-    assert len({first, second, module._key(scene)}) == 3
+    assert len({first, second, module.cache_key(scene)}) == 3
 
 
 def test_what_an_earlier_run_holds_counts(tmp_path):
@@ -172,7 +198,7 @@ def test_what_an_earlier_run_holds_counts(tmp_path):
     scene = beam(initial={"run": str(path)})
     for content in (b"one", b"another"):
         path.write_bytes(content)
-        found |= {module._key(scene), module._key(scene)}
+        found |= {module.cache_key(scene), module.cache_key(scene)}
     assert len(found) == 2
 
 

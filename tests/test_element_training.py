@@ -278,7 +278,9 @@ def test_an_interrupted_training_goes_on_as_if_it_had_not_been(few, tmp_path, mo
         patch.setattr(training.Trainer, "epoch", stops)
         with pytest.raises(KeyboardInterrupt):
             run(RECIPE, tmp_path / "parts")
+    before = torch.load(tmp_path / "parts" / "checkpoint.pt", weights_only=True)["seconds"]
     assert run(RECIPE, tmp_path / "parts")
+    assert 0.0 < before < json.loads((tmp_path / "parts" / training.CARD).read_text())["seconds"]
     whole, parts = (
         (tmp_path / name / training.WEIGHTS).read_bytes() for name in ("whole", "parts")
     )

@@ -1,12 +1,16 @@
 """The cases of validation/, as far as they are quick, and their records."""
 
+import dataclasses
 import math
 import sys
+import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import pdcorrect as pc
+from conftest import beam
 
 VALIDATION = Path(__file__).parents[1] / "validation"
 sys.path.insert(0, str(VALIDATION))
@@ -19,10 +23,13 @@ QUICK = [name for name, case in CASES.items() if case.has_quick_part]
 
 def check(name, quick):
     """All figures expected of the run are there, and none is outside."""
-    figures = {}
+    record, module = harness.Record("", quick), CASES[name].module
     for part in CASES[name].parts(quick).values():
-        figures |= part().figures
-    assert outside(figures, CASES[name].expected, quick) == []
+        outcome = part()
+        record.add(outcome.figures, [vars(table) for table in outcome.tables])
+    if hasattr(module, "summary") and not quick:
+        record.add(module.summary(record).figures, ())
+    assert outside(record.figures, CASES[name].expected, quick) == []
 
 
 COVERED = {
@@ -90,7 +97,8 @@ def test_every_case_has_a_question_and_inputs_that_exist(name):
 
 def test_fronts_are_interpolated_by_logarithms_and_end():
     run = CASES["error_time"].module
-    points = [run.Point(n, t, e) for n, t, e in (("a", 1, 16), ("b", 4, 1), ("far", 2, 20))]
+    point = sys.modules["methods"].Point
+    points = [point(n, t, e) for n, t, e in (("a", 1, 16), ("b", 4, 1), ("far", 2, 20))]
     assert [point.name for point in run.front(points)] == ["a", "b"]
     assert run.time_at(4.0, points) == pytest.approx(2.0)
     assert run.error_at(2.0, points) == pytest.approx(4.0)
@@ -116,27 +124,136 @@ def test_a_cost_is_repaid_once_the_sums_are_equal_and_never_without_a_saving():
     assert math.isinf(simulations(0.0, own=4.0, rival=3.0))
 
 
-def test_a_simulation_is_its_set_up_and_its_frames():
-    module, point = break_even(), CASES["error_time"].module.Point
-    reached = {
-        "a": [point("learned, 2", 20.0, 2.0), point("hex27, 2", 50.0, 2.0),
-              point("best on 4x4x4, 1", 1000.0, 1.0)]
-    }  # fmt: skip
-    set_up = {"learned": 0.5, "hex27": 0.1, "best on 4x4x4": 3.0}
-    (found,) = module.repaid(
-        "learned, 2", 7.9, reached, {"frames": {"a": 40}, "set_up": {"a": set_up}}
+def record_of(first, times, errors):
+    """A record of the case with one scene "a" of 41 frames."""
+    run = CASES["error_time"].module
+    tables = (
+        (run.ERRORS, ["scene", "nodes", "mm", *errors], ["a", 8, 1.0, *errors.values()]),
+        (run.TIMES, ["scene", *times], ["a", *times.values()]),
+        (run.ROUNDS, ["scene", "frames", "what", *first], ["a", 41.0, run.FIRST, *first.values()]),
     )
+    record = harness.Record("", False)
+    record.add({}, [{"name": n, "headings": h, "rows": [row]} for n, h, row in tables])
+    return record
+
+
+def test_a_simulation_is_its_first_frame_and_the_others():
+    module = break_even()
+    runs = "learned, 2", "hex27, 2", "best on 4x4x4, 1"
+    rows = (0.5, 0.1, 3.0), (20.0, 50.0, 1000.0), (2.0, 2.0, 1.0)
+    first, times, errors = (dict(zip(runs, row, strict=True)) for row in rows)
+    record = record_of(first, times, errors)
+    (found,) = module.repaid("learned, 2", 7.9, module.simulations_of(record))
     assert found.equal == 10  # 7.9 s / (2.1 s - 1.3 s)
     assert found.fixed == (10, 1)
     assert found.near == (True, False)
-    reached["a"][0] = point("learned, 2", 20.0, 0.5)
-    (found,) = module.repaid(
-        "learned, 2", 7.9, reached, {"frames": {"a": 40}, "set_up": {"a": set_up}}
-    )
+    record = record_of(first, times, errors | {"learned, 2": 0.5})
+    reached = module.simulations_of(record)
+    (found,) = module.repaid("learned, 2", 7.9, reached)
     assert found.equal is None  # no rival is so near
     del reached["a"][1:]
     with pytest.raises(KeyError):
-        module.repaid("learned, 2", 7.9, reached, {"frames": {"a": 40}, "set_up": {"a": set_up}})
+        module.repaid("learned, 2", 7.9, reached)
+
+
+class Sleeper:
+    """A method whose steppers rest for so many seconds a step, or fail at a frame."""
+
+    def __init__(self, seconds, failing=None):
+        self.seconds, self.failing, self.made = seconds, failing, 0
+
+    def stepper(self, scene):
+        self.made += 1
+        return Resting(pc.discretise(scene), self)
+
+
+class Resting:
+    def __init__(self, problem, method):
+        self.problem, self.method = problem, method
+
+    def __call__(self, state, forces=None):
+        time.sleep(self.method.seconds)
+        after = state.time + self.problem.scene.time.step
+        fails = self.method.failing is not None and after > self.method.failing
+        status = pc.Status.ITERATION_LIMIT if fails else pc.Status.CONVERGED
+        return pc.StepResult(dataclasses.replace(state, time=after), status, 1, 0.0, 0.0)
+
+    def describe(self):
+        return {"method": "rest"}
+
+
+def test_dear_methods_have_fewer_rounds_and_failures_have_none(monkeypatch, tmp_path):
+    run = CASES["error_time"].module
+    monkeypatch.setattr(sys.modules["rounds"], "ROUNDS", ((20.0, 3), (math.inf, 1)))
+    scene = beam((1, 1, 1), time={"frames": 2})
+    methods = {"cheap": Sleeper(0.001), "dear": Sleeper(0.03), "fails": Sleeper(0.0, 0.015)}
+    judged = []
+
+    def judge(name, trajectory):
+        judged.append(name)
+        return {"frames": len(trajectory)}
+
+    found = run.timed(scene, methods, judge, tmp_path / "rounds")
+    assert [each.wants() for each in found.values()] == [3, 1, 0]
+    assert [method.made for method in methods.values()] == [4, 2, 2]  # one not timed
+    assert [len(each.wall) for each in found.values()] == [3, 1, 0]
+    assert judged == ["cheap", "dear"]
+    assert found["dear"].found == {"frames": 2}
+    assert min(found["cheap"].wall) >= 1.0
+    assert min(found["dear"].first) >= 0.03
+    assert max(found["dear"].cpu) < 20.0  # it rests
+    assert not list(tmp_path.iterdir())
+
+
+def test_rounds_go_on_where_they_were_ended(monkeypatch, tmp_path):
+    run = CASES["error_time"].module
+    monkeypatch.setattr(sys.modules["rounds"], "ROUNDS", ((math.inf, 3),))
+    scene = beam((1, 1, 1), time={"frames": 2})
+    methods = {"a": Sleeper(0.001), "b": Sleeper(0.001)}
+    real = Sleeper.stepper
+
+    def stopping(self, scene):
+        if self.made == 3:
+            raise KeyboardInterrupt
+        return real(self, scene)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Sleeper, "stepper", stopping)
+        with pytest.raises(KeyboardInterrupt):
+            run.timed(scene, methods, lambda *_: {"error": 1.0}, tmp_path / "rounds")
+    assert [method.made for method in methods.values()] == [3, 3]  # two rounds of each
+    found = run.timed(scene, methods, None, tmp_path / "rounds")
+    assert [len(each.wall) for each in found.values()] == [3, 3]
+    assert found["b"].found == {"error": 1.0}
+    assert [method.made for method in methods.values()] == [5, 5]
+    assert not list(tmp_path.iterdir())
+
+
+def test_levels_go_on_where_they_were_ended(tmp_path, monkeypatch):
+    assert CASES["error_time"].module
+    reference = sys.modules["reference"]
+    monkeypatch.setenv("PDCORRECT_CACHE", str(tmp_path))
+    monkeypatch.setattr(reference, "_EVERY", 0.0)
+    load = [{"kind": "gravity", "acceleration": [0.0, 0.0, -9.81]}]
+    scene = beam((2, 1, 1), loads=load, time={"frames": 4})
+    whole = reference.positions(scene, 2, 2)
+    (path,) = (tmp_path / "levels").iterdir()
+    path.unlink()
+    real, saved = reference._save, []
+
+    def killed(path, frames, state=None):
+        real(path, frames, state)
+        saved.append(len(frames))
+        if len(saved) == 2:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(reference, "_save", killed)
+    with pytest.raises(KeyboardInterrupt):
+        reference.positions(scene, 2, 2)
+    np.testing.assert_array_equal(reference.positions(scene, 2, 2), whole)
+    assert saved == [2, 3, 4, 5, 5]
+    np.testing.assert_array_equal(reference.positions(scene, 2, 2), whole)
+    assert len(saved) == 5
 
 
 def test_all_cases_are_imported_side_by_side():

@@ -4,9 +4,8 @@ python validation/error_time/break_even.py
 
 measures, on this machine, what no other record has, and writes
 ``validation/results/break_even.json``: the time of some of the learned element's bodies and of some
-iterations of its training, and the set-up of each method in each scene, as seconds of CPU on one
-thread.  `repaid` computes the rest from that and from the record of errors and times, whose frames
-are wall times on another machine.
+iterations of its training, as seconds of CPU on one thread.  `repaid` computes the rest from the
+record of errors and times.
 """
 
 from __future__ import annotations
@@ -16,13 +15,11 @@ import math
 import os
 import sys
 import time
-import warnings
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from methods import METHODS, RIVALS, Point, time_at
+from methods import FIRST, METHODS, RIVALS, ROUNDS, Point, points_of, time_at
 
 HERE = Path(__file__).resolve().parent
 RECORD = HERE.parent / "results" / "break_even.json"
@@ -51,29 +48,28 @@ def simulations(cost: float, own: float, rival: float) -> float:
     return math.ceil(cost / (rival - own)) if rival > own else NEVER
 
 
-def stem(name: str) -> str:
-    """A method without its number of steps and its tolerance, on which no set-up depends."""
-    return name if name.endswith("Newton") else name.partition(",")[0]
-
-
 def fixed(name: str) -> tuple[str, str]:
     """Rivals whatever their error: hex27 with as many steps a frame, and the fine mesh with one."""
     quadratic = f"hex27, {name.rpartition(', ')[2]}"
     return quadratic if quadratic in METHODS else "hex27, 1", "best on 4x4x4, 1"
 
 
-def whole(points: Sequence[Point], frames: int, set_up: dict[str, float]) -> list[Point]:
-    """Points of simulations, with s of so many frames and of set-ups, by `stem`, as times."""
-    return [Point(p.name, set_up[stem(p.name)] + 1e-3 * frames * p.time, p.error) for p in points]
+def simulations_of(record: Any) -> dict[str, list[Point]]:
+    """`points_of` a record of the case, with whole simulations, s, as times."""
+    table = record.table(ROUNDS)
+    first = {row[0]: row for row in table["rows"] if row[2] == FIRST}
+    out = {}
+    for scene, points in points_of(record).items():
+        of = dict(zip(table["headings"], first[scene], strict=True))
+        others = of["frames"] - 1
+        out[scene] = [Point(p.name, of[p.name] + 1e-3 * others * p.time, p.error) for p in points]
+    return out
 
 
-def repaid(
-    name: str, cost: float, points: dict[str, list[Point]], measured: dict[str, Any]
-) -> list[Repaid]:
-    """Of a method whose data and training take ``cost`` s, in each scene."""
+def repaid(name: str, cost: float, reached: dict[str, list[Point]]) -> list[Repaid]:
+    """Of a method whose data and training take ``cost`` s, in each scene's simulations."""
     out = []
-    for scene, reached in points.items():
-        every = whole(reached, measured["frames"][scene], measured["set_up"][scene])
+    for scene, every in reached.items():
         of = {simulation.name: simulation for simulation in every}
         own = of[name]
         others = [of[other] for other in fixed(name)]
@@ -86,29 +82,6 @@ def repaid(
 
 
 # --- what is measured ----------------------------------------------------------------------
-
-
-def set_ups() -> tuple[dict[str, dict[str, float]], dict[str, int]]:
-    """Seconds of the set-ups by scene and `stem`, and frames by scene."""
-    from bodies import scenes
-
-    from pdcorrect.errors import PdcorrectWarning
-
-    first = {stem(name): method for name, method in reversed(METHODS.items())}
-    found: dict[str, dict[str, float]] = {}
-    drawn = scenes()
-    for method in first.values():  # kernels are compiled and loaded
-        method.stepper(drawn["cantilever"]).prepare()
-    for label, scene in drawn.items():
-        found[label] = {}
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", PdcorrectWarning)
-            for name, method in first.items():
-                started = time.process_time()
-                method.stepper(scene).prepare()
-                found[label][name] = round(time.process_time() - started, 4)
-        print(label, found[label], flush=True)
-    return found, {label: scene.time.frames for label, scene in drawn.items()}
 
 
 def element_times() -> dict[str, Any]:
@@ -156,15 +129,12 @@ def main() -> None:
 
     torch.set_num_threads(1)
     load = round(os.getloadavg()[0], 2)
-    set_up, frames = set_ups()
     record = {
         "date": time.strftime("%Y-%m-%d"),
         "command": "python validation/error_time/break_even.py",
         "environment": environment(),
         "load": load,
         "element": element_times(),
-        "frames": frames,
-        "set_up": set_up,
     }
     write_text(RECORD, json.dumps(record, indent=1) + "\n")
 

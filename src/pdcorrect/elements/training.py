@@ -140,7 +140,7 @@ class Trainer:
         self._symmetries = torch.arange(recipe.symmetries, device=device)
         self._pool = torch.cuda.graph_pool_handle() if "cuda" in device else None
         self._slopes = [self._slopes_of(batch) for batch in batches]
-        self.iteration = 0
+        self.iteration, self.seconds = 0, 0.0  # of all epochs
         self._loss = float("nan")
 
     def epoch(self, seconds: float | None = None) -> bool:
@@ -151,7 +151,8 @@ class Trainer:
         ConvergenceError
             If the loss is not finite, and with it the weights.
         """
-        deadline = None if seconds is None else time.monotonic() + seconds
+        started = time.monotonic()
+        deadline = None if seconds is None else started + seconds
         losses: list[Tensor] = []
         more = True
         for i in self._rng.permutation(len(self._slopes)):
@@ -168,6 +169,7 @@ class Trainer:
             self._loss = float(torch.stack(losses).mean())
             if not np.isfinite(self._loss):
                 raise ConvergenceError(f"loss {self._loss} at iteration {self.iteration}.")
+        self.seconds += time.monotonic() - started
         return more
 
     def _slopes_of(self, batch: Batch) -> Callable[[], Tensor]:
@@ -222,6 +224,7 @@ class Trainer:
             "largest_poisson": LARGEST_POISSON,
             "recipe": self._kind(),
             "validation": self.measured(),
+            "seconds": round(self.seconds, 3),
             "device": torch.cuda.get_device_name(device) if "cuda" in device else device,
             "environment": environment(),
         }
@@ -234,6 +237,7 @@ class Trainer:
         state = {
             "recipe": self._kind(),
             "iteration": self.iteration,
+            "seconds": self.seconds,
             "network": self._network.state_dict(),
             "descent": self._descent.state(),
             "rng": self._rng.bit_generator.state,
@@ -254,7 +258,7 @@ class Trainer:
             raise InputError(
                 f"{path}: of recipe {state['recipe']}: expected {self._kind()}. Use another folder."
             )
-        self.iteration = state["iteration"]
+        self.iteration, self.seconds = state["iteration"], state["seconds"]
         self._network.load_state_dict(state["network"])
         self._descent.restore(state["descent"])
         self._rng.bit_generator.state = state["rng"]
