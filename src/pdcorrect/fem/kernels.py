@@ -245,20 +245,6 @@ def transform(U, A, V, out, forward):  # type: ignore[no-untyped-def]
                 out[3 * i + j, q] = total
 
 
-@njit(inline="always", **OPTIONS)
-def unit_change(gradient, i, U, V, out):  # type: ignore[no-untyped-def]
-    """Out (9, Q) = U^T (e_i x grad N) V: the change of F by a shape function's component i."""
-    for a in range(3):
-        for b in range(3):
-            for q in range(out.shape[1]):
-                along = (
-                    V[b, q] * gradient[0, q]
-                    + V[3 + b, q] * gradient[1, q]
-                    + V[6 + b, q] * gradient[2, q]
-                )
-                out[3 * a + b, q] = U[3 * i + a, q] * along
-
-
 @njit(**OPTIONS)
 def _tangent_product(T, A):  # type: ignore[no-untyped-def]
     """A <- tangent : A in the frame of the SVD, in place."""
@@ -277,42 +263,101 @@ def _tangent_product(T, A):  # type: ignore[no-untyped-def]
 @CellLoop
 def cell_stiffness(begin, end, gradients, left, right, tangent, out):  # type: ignore[no-untyped-def]
     """Tangent stiffness of each cell as node blocks, out (C, L, L, 3, 3), N/m."""
-    width, lanes = gradients.shape[1], tangent.shape[2]
-    A, P = np.empty((9, lanes)), np.empty((9, lanes))
-    K = np.empty((width, 3, width, 3))
+    width = gradients.shape[1]
+    room, K = stiffness_room(width, tangent.shape[2]), np.empty((width, 3, width, 3))
     for c in range(begin, end):
-        stiffness(gradients[c], left[c], right[c], tangent[c], A, P, K)
+        stiffness(gradients[c], left[c], right[c], tangent[c], room, K)
         for k in range(width):
-            for l in range(width):
+            for l in range(k + 1):
                 for i in range(3):
                     for j in range(3):
-                        high = K[k, i, l, j] if k >= l else K[l, j, k, i]
-                        out[c, k, l, i, j] = high
+                        out[c, k, l, i, j] = K[k, i, l, j]
+                        out[c, l, k, j, i] = K[k, i, l, j]
+
+
+@njit(**OPTIONS)
+def stiffness_room(width, points):  # type: ignore[no-untyped-def]
+    """Work arrays of `stiffness`: frames, gradients; three (9, 9, W); (9, 3 W) and (3, 3 W)."""
+    lanes = (points + _WIDTH - 1) // _WIDTH * _WIDTH
+    frames, g = np.zeros((30, lanes)), np.zeros((width, 3, lanes))
+    W, X, C = np.empty((9, 9, lanes)), np.empty((9, 9, lanes)), np.empty((9, 9, lanes))
+    return frames, g, W, X, C, np.empty((9, 3 * lanes)), np.empty((3, 3 * lanes))
 
 
 @njit(**REDUCE)
-def stiffness(gradients, U, V, T, A, P, out):  # type: ignore[no-untyped-def]
-    """Lower triangle of one cell's tangent stiffness, out (L, 3, L, 3), N/m.
+def stiffness(gradients, U, V, T, room, out):  # type: ignore[no-untyped-def]
+    """One cell's tangent stiffness, the blocks k >= l of out (L, 3, L, 3), N/m.
 
-    The stress P that a unit amplitude of function k in direction i causes does work
-    on all other functions.  A (9, Q) and P (9, Q) are scratch.
+    At each point the elasticity C_im,jn in space, then H_ij,n = sum_m dN_k/dx_m C_im,jn for each
+    function k, and with n and the points as one long index the products with dN_l/dx_n.
+    """
+    frames, g, W, X, C, H, tiled = room
+    points, lanes, long = T.shape[1], frames.shape[1], H.shape[1]
+    for q in range(points):
+        for i in range(9):
+            frames[i, q], frames[9 + i, q] = U[i, q], V[i, q]
+        for i in range(12):
+            frames[18 + i, q] = T[i, q]
+    g[:, :, :points] = gradients
+    _elasticity(frames[:9], frames[9:18], frames[18:], W, X, C)
+    rows, flat = C.reshape(27, long), g.reshape(len(g), long)
+    for k in range(len(g)):
+        for m in range(3):
+            for n in range(3):
+                for q in range(lanes):
+                    tiled[m, n * lanes + q] = g[k, m, q]
+        for i in range(3):
+            for j in range(3):
+                x, y, z = 9 * i + j, 9 * i + 3 + j, 9 * i + 6 + j
+                for q in range(long):
+                    H[3 * i + j, q] = (
+                        tiled[0, q] * rows[x, q]
+                        + tiled[1, q] * rows[y, q]
+                        + tiled[2, q] * rows[z, q]
+                    )
+        for l in range(k + 1):
+            for i in range(3):
+                a, b, c = 0.0, 0.0, 0.0
+                for q in range(long):
+                    a += H[3 * i, q] * flat[l, q]
+                    b += H[3 * i + 1, q] * flat[l, q]
+                    c += H[3 * i + 2, q] * flat[l, q]
+                out[k, i, l, 0], out[k, i, l, 1], out[k, i, l, 2] = a, b, c
+
+
+@njit(**OPTIONS)
+def _elasticity(U, V, T, W, X, out):  # type: ignore[no-untyped-def]
+    """dP_im/dF_jn of each lane, out (9, 9, W), for the tangent in the frame of the SVD.
+
+    It is the sum over r = (a, b) of W_r X_r with W_r = U_a V_b^T and X_r = sum_s T_rs W_s.
     """
     lanes = T.shape[1]
-    for k in range(gradients.shape[0]):
-        for i in range(3):
-            unit_change(gradients[k], i, U, V, A)
-            _tangent_product(T, A)
-            transform(U, A, V, P, False)
-            for l in range(k + 1):
-                for j in range(3):
-                    total = 0.0
-                    for q in range(lanes):
-                        total += (
-                            P[3 * j, q] * gradients[l, 0, q]
-                            + P[3 * j + 1, q] * gradients[l, 1, q]
-                            + P[3 * j + 2, q] * gradients[l, 2, q]
-                        )
-                    out[k, i, l, j] = total
+    for r in range(9):
+        for f in range(9):
+            for q in range(lanes):
+                W[r, f, q] = U[3 * (f // 3) + r // 3, q] * V[3 * (f % 3) + r % 3, q]
+    for f in range(9):
+        for q in range(lanes):
+            x, y, z = W[0, f, q], W[4, f, q], W[8, f, q]
+            X[0, f, q] = T[0, q] * x + T[3, q] * y + T[4, q] * z
+            X[4, f, q] = T[3, q] * x + T[1, q] * y + T[5, q] * z
+            X[8, f, q] = T[4, q] * x + T[5, q] * y + T[2, q] * z
+        for pair in range(3):
+            i, j = pair // 2, 1 + (pair + 1) // 2
+            a, b = 3 * i + j, 3 * j + i
+            for q in range(lanes):
+                x, y = W[a, f, q], W[b, f, q]
+                X[a, f, q] = T[6 + pair, q] * x + T[9 + pair, q] * y
+                X[b, f, q] = T[6 + pair, q] * y + T[9 + pair, q] * x
+    for e in range(9):
+        for f in range(e + 1):
+            for q in range(lanes):
+                total = 0.0
+                for r in range(9):
+                    total += X[r, e, q] * W[r, f, q]
+                out[e, f, q] = total
+            for q in range(lanes):
+                out[f, e, q] = out[e, f, q]
 
 
 @njit(**OPTIONS)
