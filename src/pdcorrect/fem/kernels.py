@@ -31,28 +31,32 @@ def deformation(u, nodes, gradients, diagonal, F):  # type: ignore[no-untyped-de
         for j in range(3):
             for q in range(F.shape[1]):
                 F[3 * i + j, q] = diagonal if i == j else 0.0
-    for k in range(nodes.shape[0]):
-        node = nodes[k]
-        for i in range(3):
-            value = u[node, i]
-            for j in range(3):
-                for q in range(F.shape[1]):
-                    F[3 * i + j, q] += value * gradients[k, j, q]
+    count, long = len(nodes), 3 * F.shape[1]  # directions and points as one index
+    rows, out = gradients.reshape(len(gradients), long), F.reshape(3, long)
+    for k in range(0, count, 2):  # two functions for each store; an odd last one twice, as 1 and 0
+        l = min(k + 1, count - 1)
+        n, m, share = nodes[k], nodes[l], 1.0 if l > k else 0.0
+        a, b, c = u[n, 0], u[n, 1], u[n, 2]
+        d, e, f = share * u[m, 0], share * u[m, 1], share * u[m, 2]
+        for q in range(long):
+            x, y = rows[k, q], rows[l, q]
+            out[0, q] += a * x + d * y
+            out[1, q] += b * x + e * y
+            out[2, q] += c * x + f * y
 
 
 @njit(**REDUCE)
 def nodal_forces(P, gradients, sign, out):  # type: ignore[no-untyped-def]
     """out[k, i] = sign sum_q P_ij dN_k/dx_j for P (9, Q), weights included."""
-    for k in range(out.shape[0]):
-        for i in range(3):
-            total = 0.0
-            for q in range(P.shape[1]):
-                total += (
-                    P[3 * i, q] * gradients[k, 0, q]
-                    + P[3 * i + 1, q] * gradients[k, 1, q]
-                    + P[3 * i + 2, q] * gradients[k, 2, q]
-                )
-            out[k, i] = sign * total
+    long = 3 * P.shape[1]  # directions and points as one index
+    rows, stress = gradients.reshape(len(gradients), long), P.reshape(3, long)
+    for k in range(len(out)):
+        a, b, c = 0.0, 0.0, 0.0
+        for q in range(long):
+            a += stress[0, q] * rows[k, q]
+            b += stress[1, q] * rows[k, q]
+            c += stress[2, q] * rows[k, q]
+        out[k, 0], out[k, 1], out[k, 2] = sign * a, sign * b, sign * c
 
 
 @njit(**REDUCE)
@@ -84,7 +88,7 @@ def block_shape(points):  # type: ignore[no-untyped-def]
     A power of two, so that blocks are the same whatever the number of threads.
     """
     cells = CHUNK
-    while cells > 1 and 2 * cells * points > 3 * _LANES:
+    while cells > 1 and 2 * cells * points > 5 * _LANES:
         cells //= 2
     return cells, (cells * points + _WIDTH - 1) // _WIDTH * _WIDTH
 
@@ -234,15 +238,17 @@ def apply_linearised(  # type: ignore[no-untyped-def]
 def transform(U, A, V, out, forward):  # type: ignore[no-untyped-def]
     """Out = U^T A V (forward) or U A V^T, all (9, Q)."""
     for i in range(3):
-        for j in range(3):
-            for q in range(A.shape[1]):
-                total = 0.0
-                for a in range(3):
-                    left = U[3 * a + i, q] if forward else U[3 * i + a, q]
-                    for b in range(3):
-                        right = V[3 * b + j, q] if forward else V[3 * j + b, q]
-                        total += left * A[3 * a + b, q] * right
-                out[3 * i + j, q] = total
+        l, m, n = (i, 3 + i, 6 + i) if forward else (3 * i, 3 * i + 1, 3 * i + 2)
+        for q in range(A.shape[1]):
+            u, v, w = U[l, q], U[m, q], U[n, q]
+            x = u * A[0, q] + v * A[3, q] + w * A[6, q]
+            y = u * A[1, q] + v * A[4, q] + w * A[7, q]
+            z = u * A[2, q] + v * A[5, q] + w * A[8, q]
+            for j in range(3):
+                if forward:
+                    out[3 * i + j, q] = x * V[j, q] + y * V[3 + j, q] + z * V[6 + j, q]
+                else:
+                    out[3 * i + j, q] = x * V[3 * j, q] + y * V[3 * j + 1, q] + z * V[3 * j + 2, q]
 
 
 @njit(**OPTIONS)
