@@ -283,11 +283,10 @@ def cell_stiffness(begin, end, gradients, left, right, tangent, out):  # type: i
 
 @njit(**OPTIONS)
 def stiffness_room(width, points):  # type: ignore[no-untyped-def]
-    """Work arrays of `stiffness`: frames, gradients; three (9, 9, W); (9, 3 W) and (3, 3 W)."""
+    """Work arrays of `stiffness`: (30 + 9, W), (L, 3, W), (9, 9, W), (9, 3 W) and (3, 3 W)."""
     lanes = (points + _WIDTH - 1) // _WIDTH * _WIDTH
-    frames, g = np.zeros((30, lanes)), np.zeros((width, 3, lanes))
-    W, X, C = np.empty((9, 9, lanes)), np.empty((9, 9, lanes)), np.empty((9, 9, lanes))
-    return frames, g, W, X, C, np.empty((9, 3 * lanes)), np.empty((3, 3 * lanes))
+    frames, g, C = np.zeros((39, lanes)), np.zeros((width, 3, lanes)), np.empty((9, 9, lanes))
+    return frames, g, C, np.empty((9, 3 * lanes)), np.empty((3, 3 * lanes))
 
 
 @njit(**REDUCE)
@@ -297,7 +296,7 @@ def stiffness(gradients, U, V, T, room, out):  # type: ignore[no-untyped-def]
     At each point the elasticity C_im,jn in space, then H_ij,n = sum_m dN_k/dx_m C_im,jn for each
     function k, and with n and the points as one long index the products with dN_l/dx_n.
     """
-    frames, g, W, X, C, H, tiled = room
+    frames, g, C, H, tiled = room
     points, lanes, long = T.shape[1], frames.shape[1], H.shape[1]
     for q in range(points):
         for i in range(9):
@@ -305,7 +304,7 @@ def stiffness(gradients, U, V, T, room, out):  # type: ignore[no-untyped-def]
         for i in range(12):
             frames[18 + i, q] = T[i, q]
     g[:, :, :points] = gradients
-    _elasticity(frames[:9], frames[9:18], frames[18:], W, X, C)
+    _elasticity(frames[:9], frames[9:18], frames[18:30], frames[30:], C)
     rows, flat = C.reshape(27, long), g.reshape(len(g), long)
     for k in range(len(g)):
         for m in range(3):
@@ -332,38 +331,29 @@ def stiffness(gradients, U, V, T, room, out):  # type: ignore[no-untyped-def]
 
 
 @njit(**OPTIONS)
-def _elasticity(U, V, T, W, X, out):  # type: ignore[no-untyped-def]
+def _elasticity(U, V, T, A, out):  # type: ignore[no-untyped-def]
     """dP_im/dF_jn of each lane, out (9, 9, W), for the tangent in the frame of the SVD.
 
-    It is the sum over r = (a, b) of W_r X_r with W_r = U_a V_b^T and X_r = sum_s T_rs W_s.
+    Column jn is U A V^T with A (9, W) the tangent times U^T e_j e_n^T V.
     """
     lanes = T.shape[1]
-    for r in range(9):
-        for f in range(9):
-            for q in range(lanes):
-                W[r, f, q] = U[3 * (f // 3) + r // 3, q] * V[3 * (f % 3) + r % 3, q]
     for f in range(9):
-        for q in range(lanes):
-            x, y, z = W[0, f, q], W[4, f, q], W[8, f, q]
-            X[0, f, q] = T[0, q] * x + T[3, q] * y + T[4, q] * z
-            X[4, f, q] = T[3, q] * x + T[1, q] * y + T[5, q] * z
-            X[8, f, q] = T[4, q] * x + T[5, q] * y + T[2, q] * z
-        for pair in range(3):
-            i, j = pair // 2, 1 + (pair + 1) // 2
-            a, b = 3 * i + j, 3 * j + i
+        j, n = 3 * (f // 3), 3 * (f % 3)
+        for i in range(3):
+            for m in range(3):
+                for q in range(lanes):
+                    A[3 * i + m, q] = U[j + i, q] * V[n + m, q]
+        _tangent_product(T, A)
+        for m in range(3):
             for q in range(lanes):
-                x, y = W[a, f, q], W[b, f, q]
-                X[a, f, q] = T[6 + pair, q] * x + T[9 + pair, q] * y
-                X[b, f, q] = T[6 + pair, q] * y + T[9 + pair, q] * x
-    for e in range(9):
-        for f in range(e + 1):
-            for q in range(lanes):
-                total = 0.0
-                for r in range(9):
-                    total += X[r, e, q] * W[r, f, q]
-                out[e, f, q] = total
-            for q in range(lanes):
-                out[f, e, q] = out[e, f, q]
+                a, b, c = V[3 * m, q], V[3 * m + 1, q], V[3 * m + 2, q]
+                x = A[0, q] * a + A[1, q] * b + A[2, q] * c
+                y = A[3, q] * a + A[4, q] * b + A[5, q] * c
+                z = A[6, q] * a + A[7, q] * b + A[8, q] * c
+                for i in range(3):
+                    out[3 * i + m, f, q] = (
+                        U[3 * i, q] * x + U[3 * i + 1, q] * y + U[3 * i + 2, q] * z
+                    )
 
 
 @njit(**OPTIONS)
