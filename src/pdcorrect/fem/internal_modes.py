@@ -9,7 +9,14 @@ from numpy.typing import NDArray
 from pdcorrect.fem.cell_loops import CellLoop
 from pdcorrect.fem.decomposition import OPTIONS, scratch, signed_svd_lanes
 from pdcorrect.fem.energies import principal_stress_lanes, principal_tangent_lanes, stress_lanes
-from pdcorrect.fem.kernels import deformation, nodal_forces, stiffness, stiffness_room, total
+from pdcorrect.fem.kernels import (
+    REDUCE,
+    deformation,
+    nodal_forces,
+    stiffness,
+    stiffness_room,
+    total,
+)
 
 Array = NDArray[np.float64]
 
@@ -187,26 +194,35 @@ def _copy_row(blocks, row):  # type: ignore[no-untyped-def]
 @njit(**OPTIONS)
 def _reduce(solved, nodes, modes, r, out):  # type: ignore[no-untyped-def]
     """Subtract (K_bb^-1 K_bu)^T times the modes' part of r (N + B, 3) from out (N, 3)."""
+    row = np.empty(solved.shape[2])
     for c in range(len(nodes)):
+        row[:] = 0.0
         for b in range(solved.shape[1]):
             value = r[modes[c, b // 3], b % 3]
-            for k in range(nodes.shape[1]):
-                for j in range(3):
-                    out[nodes[c, k], j] -= solved[c, b, 3 * k + j] * value
+            for j in range(len(row)):
+                row[j] += solved[c, b, j] * value
+        for k in range(nodes.shape[1]):
+            for j in range(3):
+                out[nodes[c, k], j] -= row[3 * k + j]
 
 
-@njit(**OPTIONS)
+@njit(**REDUCE)
 def _recover(inverse, solved, nodes, modes, r, out):  # type: ignore[no-untyped-def]
     """Modes of out (N + B, 3): K_bb^-1 times those of r less K_bb^-1 K_bu times its nodes."""
+    row, force = np.empty(solved.shape[2]), np.empty(solved.shape[1])
     for c in range(len(nodes)):
-        for b in range(solved.shape[1]):
-            total = 0.0
-            for a in range(solved.shape[1]):
-                total += inverse[c, b, a] * r[modes[c, a // 3], a % 3]
-            for k in range(nodes.shape[1]):
-                for j in range(3):
-                    total -= solved[c, b, 3 * k + j] * out[nodes[c, k], j]
-            out[modes[c, b // 3], b % 3] = total
+        for k in range(nodes.shape[1]):
+            for j in range(3):
+                row[3 * k + j] = out[nodes[c, k], j]
+        for b in range(len(force)):
+            force[b] = r[modes[c, b // 3], b % 3]
+        for b in range(len(force)):
+            held, moved = 0.0, 0.0
+            for a in range(len(force)):
+                held += inverse[c, b, a] * force[a]
+            for j in range(len(row)):
+                moved += solved[c, b, j] * row[j]
+            out[modes[c, b // 3], b % 3] = held - moved
 
 
 @njit(**OPTIONS)
