@@ -10,7 +10,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from pdcorrect.fem import turned_strains
+from pdcorrect.fem import turned_strains, turned_tangents
 from pdcorrect.fem.assembly import Assembly
 from pdcorrect.fem.cube_symmetry import PATTERNS
 from pdcorrect.fem.hexahedron import VTK_CORNERS, shape_derivatives
@@ -211,13 +211,12 @@ class CorrectionTangent:
     shift: Array
 
     def apply(self, x: Array) -> Array:
-        """Times x (N or more, 3), without the matrices."""
+        """Times x (N or more, 3)."""
         correction = self.correction
         by_cell = np.empty((*correction.cells.shape, 3))
-        turned_strains.products(
-            len(by_cell), x, self.u, correction.cells, correction.shapes, correction.sizes,
-            correction.matrices, self.shift, self.project, by_cell,
-        )  # fmt: skip
+        turned_tangents.products(
+            len(by_cell), x, correction.cells, correction.shapes, self.matrices, by_cell
+        )
         return correction._gathered(x, by_cell)
 
     @cached_property
@@ -225,7 +224,7 @@ class CorrectionTangent:
         """(C, 21, 21), N/m, by the amplitudes of the cells' shapes."""
         correction = self.correction
         out = np.empty((len(correction.cells), 21, 21))
-        turned_strains.tangents(
+        turned_tangents.tangents(
             len(out), self.u, correction.cells, correction.shapes, correction.sizes,
             correction.matrices, self.shift, self.project, out,
         )  # fmt: skip
@@ -233,7 +232,7 @@ class CorrectionTangent:
 
     def add_to(self, blocks: Array) -> None:
         """Add the cells' matrices to blocks (C, L, L, 3, 3) of nodes, N/m."""
-        turned_strains.add_blocks(len(blocks), self.matrices, self.correction.shapes, blocks)
+        turned_tangents.add_blocks(len(blocks), self.matrices, self.correction.shapes, blocks)
 
 
 def cell_shapes(corners: Array) -> tuple[Array, Array]:

@@ -9,7 +9,14 @@ from numpy.typing import NDArray
 from pdcorrect.fem.cell_loops import CellLoop
 from pdcorrect.fem.decomposition import OPTIONS, scratch, signed_svd_lanes
 from pdcorrect.fem.energies import principal_stress_lanes, principal_tangent_lanes, stress_lanes
-from pdcorrect.fem.kernels import deformation, nodal_forces, stiffness, total
+from pdcorrect.fem.kernels import (
+    REDUCE,
+    deformation,
+    nodal_forces,
+    stiffness,
+    stiffness_room,
+    total,
+)
 
 Array = NDArray[np.float64]
 
@@ -38,7 +45,7 @@ def relax(  # type: ignore[no-untyped-def]
     """
     lanes, width = weights.shape[2], cells.shape[1] - nodes
     F, U, V, B, S, s, v, k = scratch(lanes)
-    P, A, T = np.empty((9, lanes)), np.empty((9, lanes)), np.empty((12, lanes))
+    P, T, room = np.empty((9, lanes)), np.empty((12, lanes)), stiffness_room(width, lanes)
     t, density = np.empty((3, lanes)), np.empty(lanes)
     forces, old, step = np.empty((width, 3)), np.empty((width, 3)), np.empty((width, 3))
     K, flat = np.empty((width, 3, width, 3)), step.reshape(3 * width, 1)
@@ -77,7 +84,7 @@ def relax(  # type: ignore[no-untyped-def]
             if not (last <= _CHORD * near and _largest(step) <= 0.1 * last):
                 for cautious in (last > near, True):
                     principal_tangent_lanes(model, s, v, k, shear, volume, start, cautious, T)
-                    stiffness(here, U, V, T, A, P, K)
+                    stiffness(here, U, V, T, room, K)
                     if _factorise(M, 1e-12) or cautious:
                         break
                 step[:] = forces
@@ -109,13 +116,15 @@ def _factorise(M, share):  # type: ignore[no-untyped-def]
     positive = True
     for i in range(len(M)):
         for j in range(i):
+            entry = M[i, j]
             for n in range(j):
-                M[i, j] -= M[i, n] * M[j, n]
-            M[i, j] /= M[j, j]
+                entry -= M[i, n] * M[j, n]
+            M[i, j] = entry / M[j, j]
+        pivot = M[i, i]
         for n in range(i):
-            M[i, i] -= M[i, n] * M[i, n]
-        positive &= M[i, i] > least
-        M[i, i] = np.sqrt(max(M[i, i], least))
+            pivot -= M[i, n] * M[i, n]
+        positive &= pivot > least
+        M[i, i] = np.sqrt(max(pivot, least))
     return positive
 
 
@@ -142,17 +151,17 @@ def _eliminate(  # type: ignore[no-untyped-def]
     begin, end, blocks, nodes, shift, condensed, inverse, solved, positive
 ):
     """Fill K_uu - K_ub K_bb^-1 K_bu, K_bb^-1, K_bb^-1 K_bu and whether K_bb is positive."""
-    width = blocks.shape[1]
-    m, n = 3 * (width - nodes), 3 * nodes
+    m, n = 3 * (blocks.shape[1] - nodes), 3 * nodes
     K, right = np.empty((m, m)), np.empty((m, m + n))
+    coupling, row = np.empty((m, n)), np.empty(n)
     for c in range(begin, end):
         for i in range(m):
             k, a = nodes + i // 3, i % 3
             for j in range(m):
                 K[i, j] = blocks[c, k, nodes + j // 3, a, j % 3]
                 right[i, j] = 1.0 if i == j else 0.0
-            for j in range(n):
-                right[i, m + j] = blocks[c, k, j // 3, a, j % 3]
+            _copy_row(blocks[c, k, :nodes, a], coupling[i])
+            right[i, m:] = coupling[i]
         largest = 0.0
         for i in range(m):
             largest = max(largest, K[i, i])
@@ -160,42 +169,60 @@ def _eliminate(  # type: ignore[no-untyped-def]
             K[i, i] += shift * largest
         positive[c] = _factorise(K, 0.0)
         _substitute(K, right)
-        for i in range(m):
-            for j in range(m):
-                inverse[c, i, j] = right[i, j]
-            for j in range(n):
-                solved[c, i, j] = right[i, m + j]
+        inverse[c] = right[:, :m]
+        solved[c] = right[:, m:]
         for i in range(n):
-            for j in range(n):
-                value = blocks[c, i // 3, j // 3, i % 3, j % 3]
-                for b in range(m):
-                    value -= blocks[c, nodes + b // 3, i // 3, b % 3, i % 3] * right[b, m + j]
-                condensed[c, i // 3, j // 3, i % 3, j % 3] = value
+            _copy_row(blocks[c, i // 3, :nodes, i % 3], row)
+            for b in range(0, m, 3):
+                x, y, z = coupling[b, i], coupling[b + 1, i], coupling[b + 2, i]
+                for j in range(n):
+                    row[j] -= (
+                        x * solved[c, b, j] + y * solved[c, b + 1, j] + z * solved[c, b + 2, j]
+                    )
+            for j in range(nodes):
+                for a in range(3):
+                    condensed[c, i // 3, j, i % 3, a] = row[3 * j + a]
+
+
+@njit(**OPTIONS)
+def _copy_row(blocks, row):  # type: ignore[no-untyped-def]
+    for k in range(len(blocks)):
+        for a in range(3):
+            row[3 * k + a] = blocks[k, a]
 
 
 @njit(**OPTIONS)
 def _reduce(solved, nodes, modes, r, out):  # type: ignore[no-untyped-def]
     """Subtract (K_bb^-1 K_bu)^T times the modes' part of r (N + B, 3) from out (N, 3)."""
+    row = np.empty(solved.shape[2])
     for c in range(len(nodes)):
+        row[:] = 0.0
         for b in range(solved.shape[1]):
             value = r[modes[c, b // 3], b % 3]
-            for k in range(nodes.shape[1]):
-                for j in range(3):
-                    out[nodes[c, k], j] -= solved[c, b, 3 * k + j] * value
+            for j in range(len(row)):
+                row[j] += solved[c, b, j] * value
+        for k in range(nodes.shape[1]):
+            for j in range(3):
+                out[nodes[c, k], j] -= row[3 * k + j]
 
 
-@njit(**OPTIONS)
+@njit(**REDUCE)
 def _recover(inverse, solved, nodes, modes, r, out):  # type: ignore[no-untyped-def]
     """Modes of out (N + B, 3): K_bb^-1 times those of r less K_bb^-1 K_bu times its nodes."""
+    row, force = np.empty(solved.shape[2]), np.empty(solved.shape[1])
     for c in range(len(nodes)):
-        for b in range(solved.shape[1]):
-            total = 0.0
-            for a in range(solved.shape[1]):
-                total += inverse[c, b, a] * r[modes[c, a // 3], a % 3]
-            for k in range(nodes.shape[1]):
-                for j in range(3):
-                    total -= solved[c, b, 3 * k + j] * out[nodes[c, k], j]
-            out[modes[c, b // 3], b % 3] = total
+        for k in range(nodes.shape[1]):
+            for j in range(3):
+                row[3 * k + j] = out[nodes[c, k], j]
+        for b in range(len(force)):
+            force[b] = r[modes[c, b // 3], b % 3]
+        for b in range(len(force)):
+            held, moved = 0.0, 0.0
+            for a in range(len(force)):
+                held += inverse[c, b, a] * force[a]
+            for j in range(len(row)):
+                moved += solved[c, b, j] * row[j]
+            out[modes[c, b // 3], b % 3] = held - moved
 
 
 @njit(**OPTIONS)

@@ -31,28 +31,32 @@ def deformation(u, nodes, gradients, diagonal, F):  # type: ignore[no-untyped-de
         for j in range(3):
             for q in range(F.shape[1]):
                 F[3 * i + j, q] = diagonal if i == j else 0.0
-    for k in range(nodes.shape[0]):
-        node = nodes[k]
-        for i in range(3):
-            value = u[node, i]
-            for j in range(3):
-                for q in range(F.shape[1]):
-                    F[3 * i + j, q] += value * gradients[k, j, q]
+    count, long = len(nodes), 3 * F.shape[1]  # directions and points as one index
+    rows, out = gradients.reshape(len(gradients), long), F.reshape(3, long)
+    for k in range(0, count, 2):  # two functions for each store; an odd last one twice, as 1 and 0
+        l = min(k + 1, count - 1)
+        n, m, share = nodes[k], nodes[l], 1.0 if l > k else 0.0
+        a, b, c = u[n, 0], u[n, 1], u[n, 2]
+        d, e, f = share * u[m, 0], share * u[m, 1], share * u[m, 2]
+        for q in range(long):
+            x, y = rows[k, q], rows[l, q]
+            out[0, q] += a * x + d * y
+            out[1, q] += b * x + e * y
+            out[2, q] += c * x + f * y
 
 
 @njit(**REDUCE)
 def nodal_forces(P, gradients, sign, out):  # type: ignore[no-untyped-def]
     """out[k, i] = sign sum_q P_ij dN_k/dx_j for P (9, Q), weights included."""
-    for k in range(out.shape[0]):
-        for i in range(3):
-            total = 0.0
-            for q in range(P.shape[1]):
-                total += (
-                    P[3 * i, q] * gradients[k, 0, q]
-                    + P[3 * i + 1, q] * gradients[k, 1, q]
-                    + P[3 * i + 2, q] * gradients[k, 2, q]
-                )
-            out[k, i] = sign * total
+    long = 3 * P.shape[1]  # directions and points as one index
+    rows, stress = gradients.reshape(len(gradients), long), P.reshape(3, long)
+    for k in range(len(out)):
+        a, b, c = 0.0, 0.0, 0.0
+        for q in range(long):
+            a += stress[0, q] * rows[k, q]
+            b += stress[1, q] * rows[k, q]
+            c += stress[2, q] * rows[k, q]
+        out[k, 0], out[k, 1], out[k, 2] = sign * a, sign * b, sign * c
 
 
 @njit(**REDUCE)
@@ -84,7 +88,7 @@ def block_shape(points):  # type: ignore[no-untyped-def]
     A power of two, so that blocks are the same whatever the number of threads.
     """
     cells = CHUNK
-    while cells > 1 and 2 * cells * points > 3 * _LANES:
+    while cells > 1 and 2 * cells * points > 5 * _LANES:
         cells //= 2
     return cells, (cells * points + _WIDTH - 1) // _WIDTH * _WIDTH
 
@@ -234,29 +238,17 @@ def apply_linearised(  # type: ignore[no-untyped-def]
 def transform(U, A, V, out, forward):  # type: ignore[no-untyped-def]
     """Out = U^T A V (forward) or U A V^T, all (9, Q)."""
     for i in range(3):
-        for j in range(3):
-            for q in range(A.shape[1]):
-                total = 0.0
-                for a in range(3):
-                    left = U[3 * a + i, q] if forward else U[3 * i + a, q]
-                    for b in range(3):
-                        right = V[3 * b + j, q] if forward else V[3 * j + b, q]
-                        total += left * A[3 * a + b, q] * right
-                out[3 * i + j, q] = total
-
-
-@njit(inline="always", **OPTIONS)
-def unit_change(gradient, i, U, V, out):  # type: ignore[no-untyped-def]
-    """Out (9, Q) = U^T (e_i x grad N) V: the change of F by a shape function's component i."""
-    for a in range(3):
-        for b in range(3):
-            for q in range(out.shape[1]):
-                along = (
-                    V[b, q] * gradient[0, q]
-                    + V[3 + b, q] * gradient[1, q]
-                    + V[6 + b, q] * gradient[2, q]
-                )
-                out[3 * a + b, q] = U[3 * i + a, q] * along
+        l, m, n = (i, 3 + i, 6 + i) if forward else (3 * i, 3 * i + 1, 3 * i + 2)
+        for q in range(A.shape[1]):
+            u, v, w = U[l, q], U[m, q], U[n, q]
+            x = u * A[0, q] + v * A[3, q] + w * A[6, q]
+            y = u * A[1, q] + v * A[4, q] + w * A[7, q]
+            z = u * A[2, q] + v * A[5, q] + w * A[8, q]
+            for j in range(3):
+                if forward:
+                    out[3 * i + j, q] = x * V[j, q] + y * V[3 + j, q] + z * V[6 + j, q]
+                else:
+                    out[3 * i + j, q] = x * V[3 * j, q] + y * V[3 * j + 1, q] + z * V[3 * j + 2, q]
 
 
 @njit(**OPTIONS)
@@ -277,42 +269,91 @@ def _tangent_product(T, A):  # type: ignore[no-untyped-def]
 @CellLoop
 def cell_stiffness(begin, end, gradients, left, right, tangent, out):  # type: ignore[no-untyped-def]
     """Tangent stiffness of each cell as node blocks, out (C, L, L, 3, 3), N/m."""
-    width, lanes = gradients.shape[1], tangent.shape[2]
-    A, P = np.empty((9, lanes)), np.empty((9, lanes))
-    K = np.empty((width, 3, width, 3))
+    width = gradients.shape[1]
+    room, K = stiffness_room(width, tangent.shape[2]), np.empty((width, 3, width, 3))
     for c in range(begin, end):
-        stiffness(gradients[c], left[c], right[c], tangent[c], A, P, K)
+        stiffness(gradients[c], left[c], right[c], tangent[c], room, K)
         for k in range(width):
-            for l in range(width):
+            for l in range(k + 1):
                 for i in range(3):
                     for j in range(3):
-                        high = K[k, i, l, j] if k >= l else K[l, j, k, i]
-                        out[c, k, l, i, j] = high
+                        out[c, k, l, i, j] = K[k, i, l, j]
+                        out[c, l, k, j, i] = K[k, i, l, j]
+
+
+@njit(**OPTIONS)
+def stiffness_room(width, points):  # type: ignore[no-untyped-def]
+    """Work arrays of `stiffness`: (30 + 9, W), (L, 3, W), (9, 9, W), (9, 3 W) and (3, 3 W)."""
+    lanes = (points + _WIDTH - 1) // _WIDTH * _WIDTH
+    frames, g, C = np.zeros((39, lanes)), np.zeros((width, 3, lanes)), np.empty((9, 9, lanes))
+    return frames, g, C, np.empty((9, 3 * lanes)), np.empty((3, 3 * lanes))
 
 
 @njit(**REDUCE)
-def stiffness(gradients, U, V, T, A, P, out):  # type: ignore[no-untyped-def]
-    """Lower triangle of one cell's tangent stiffness, out (L, 3, L, 3), N/m.
+def stiffness(gradients, U, V, T, room, out):  # type: ignore[no-untyped-def]
+    """One cell's tangent stiffness, the blocks k >= l of out (L, 3, L, 3), N/m.
 
-    The stress P that a unit amplitude of function k in direction i causes does work
-    on all other functions.  A (9, Q) and P (9, Q) are scratch.
+    At each point the elasticity C_im,jn in space, then H_ij,n = sum_m dN_k/dx_m C_im,jn for each
+    function k, and with n and the points as one long index the products with dN_l/dx_n.
+    """
+    frames, g, C, H, tiled = room
+    points, lanes, long = T.shape[1], frames.shape[1], H.shape[1]
+    for q in range(points):
+        for i in range(9):
+            frames[i, q], frames[9 + i, q] = U[i, q], V[i, q]
+        for i in range(12):
+            frames[18 + i, q] = T[i, q]
+    g[:, :, :points] = gradients
+    _elasticity(frames[:9], frames[9:18], frames[18:30], frames[30:], C)
+    rows, flat = C.reshape(27, long), g.reshape(len(g), long)
+    for k in range(len(g)):
+        for m in range(3):
+            for n in range(3):
+                for q in range(lanes):
+                    tiled[m, n * lanes + q] = g[k, m, q]
+        for i in range(3):
+            for j in range(3):
+                x, y, z = 9 * i + j, 9 * i + 3 + j, 9 * i + 6 + j
+                for q in range(long):
+                    H[3 * i + j, q] = (
+                        tiled[0, q] * rows[x, q]
+                        + tiled[1, q] * rows[y, q]
+                        + tiled[2, q] * rows[z, q]
+                    )
+        for l in range(k + 1):
+            for i in range(3):
+                a, b, c = 0.0, 0.0, 0.0
+                for q in range(long):
+                    a += H[3 * i, q] * flat[l, q]
+                    b += H[3 * i + 1, q] * flat[l, q]
+                    c += H[3 * i + 2, q] * flat[l, q]
+                out[k, i, l, 0], out[k, i, l, 1], out[k, i, l, 2] = a, b, c
+
+
+@njit(**OPTIONS)
+def _elasticity(U, V, T, A, out):  # type: ignore[no-untyped-def]
+    """dP_im/dF_jn of each lane, out (9, 9, W), for the tangent in the frame of the SVD.
+
+    Column jn is U A V^T with A (9, W) the tangent times U^T e_j e_n^T V.
     """
     lanes = T.shape[1]
-    for k in range(gradients.shape[0]):
+    for f in range(9):
+        j, n = 3 * (f // 3), 3 * (f % 3)
         for i in range(3):
-            unit_change(gradients[k], i, U, V, A)
-            _tangent_product(T, A)
-            transform(U, A, V, P, False)
-            for l in range(k + 1):
-                for j in range(3):
-                    total = 0.0
-                    for q in range(lanes):
-                        total += (
-                            P[3 * j, q] * gradients[l, 0, q]
-                            + P[3 * j + 1, q] * gradients[l, 1, q]
-                            + P[3 * j + 2, q] * gradients[l, 2, q]
-                        )
-                    out[k, i, l, j] = total
+            for m in range(3):
+                for q in range(lanes):
+                    A[3 * i + m, q] = U[j + i, q] * V[n + m, q]
+        _tangent_product(T, A)
+        for m in range(3):
+            for q in range(lanes):
+                a, b, c = V[3 * m, q], V[3 * m + 1, q], V[3 * m + 2, q]
+                x = A[0, q] * a + A[1, q] * b + A[2, q] * c
+                y = A[3, q] * a + A[4, q] * b + A[5, q] * c
+                z = A[6, q] * a + A[7, q] * b + A[8, q] * c
+                for i in range(3):
+                    out[3 * i + m, f, q] = (
+                        U[3 * i, q] * x + U[3 * i + 1, q] * y + U[3 * i + 2, q] * z
+                    )
 
 
 @njit(**OPTIONS)

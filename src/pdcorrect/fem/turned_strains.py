@@ -20,11 +20,7 @@ derivatives
     (tr S - S) w = sum_m R^T h_m x y_m + a axial(S Y),
 
 [w] the matrix of the cross product with w, axial(A)_i = e_ijk A_jk: the second part is what the
-frame's turning adds, without which forces would have no potential.  Second derivatives are the
-imaginary part of the first after a small imaginary step, exact to rounding (Squire and Trapp 1998);
-the frame of that step is known: with D = R^T dF, R turns by R [r] and S changes by D - [r] S,
-
-    (tr S - S) r = -axial(D).
+frame's turning adds, without which forces would have no potential.
 
 Everything here counts S and F times a, so that all numbers of z are lengths.
 
@@ -46,9 +42,9 @@ from numba import njit
 from pdcorrect.fem.cell_loops import CHUNK, CellLoop
 from pdcorrect.fem.decomposition import OPTIONS, scratch, signed_svd_lanes
 
-_ROOT = np.sqrt(0.5)
-_ROWS = np.array([0, 1, 2, 1, 2, 0])
-_COLUMNS = np.array([0, 1, 2, 2, 0, 1])
+ROOT = np.sqrt(0.5)
+ROWS = np.array([0, 1, 2, 1, 2, 0])
+COLUMNS = np.array([0, 1, 2, 2, 0, 1])
 KINK = 1e-9
 """Of the size: sums of two stretches below it count as it."""
 FADES, GONE = 0.6, 0.05
@@ -60,13 +56,11 @@ Both are so far apart that energy still grows on the way in where K is as large 
 """
 SHARES = np.repeat([0.5, 1.0], [6, 12])
 """Of the squares of z's numbers in q: that of a cell stretched 1.4 times is 0.1, 2 times 0.6."""
-_FADING, _SHRINKING, _THIRD = 1.0 / (FADES - GONE), 1.0 / (HUGE - LARGE), 1.0 / 3.0
-_STEP = 1e-20
-"""The imaginary step, of displacements."""
+_FADING, _SHRINKING, THIRD = 1.0 / (FADES - GONE), 1.0 / (HUGE - LARGE), 1.0 / 3.0
 
 
 class Cell(NamedTuple):
-    """One cell's arrays, complex where they took an imaginary step.
+    """One cell's arrays.
 
     The amplitudes v (7, 3) of its shapes; R, S and Y = (tr S - S)^-1; A, S's adjugate; z and
     the derivatives y by it (18,); and room: T, B (3, 3), t, w (3,).
@@ -86,13 +80,11 @@ class Cell(NamedTuple):
 
 
 @njit(**OPTIONS)
-def _cell(kind):  # type: ignore[no-untyped-def]
-    """Room for a cell, of a type of numbers."""
-    v = np.empty((7, 3), kind)
-    R, S, Y = np.empty((3, 3), kind), np.empty((3, 3), kind), np.empty((3, 3), kind)
-    A, T, B = np.empty((3, 3), kind), np.empty((3, 3), kind), np.empty((3, 3), kind)
-    z, y, t, w = np.empty(18, kind), np.empty(18, kind), np.empty(3, kind), np.empty(3, kind)
-    return Cell(v, R, S, Y, A, z, y, T, B, t, w)
+def new_cell():  # type: ignore[no-untyped-def]
+    """Room for a cell."""
+    v, R, S, Y = np.empty((7, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    A, T, B = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    return Cell(v, R, S, Y, A, np.empty(18), np.empty(18), T, B, np.empty(3), np.empty(3))
 
 
 @njit(**OPTIONS)
@@ -116,7 +108,7 @@ def _axial(A, factor, out):  # type: ignore[no-untyped-def]
 
 
 @njit(**OPTIONS)
-def _amplitudes(u, nodes, shapes, v):  # type: ignore[no-untyped-def]
+def amplitudes(u, nodes, shapes, v):  # type: ignore[no-untyped-def]
     """V (7, 3): rows of shapes (7, 8) times the corners' displacements."""
     for a in range(7):
         x, y, z = 0.0, 0.0, 0.0
@@ -129,8 +121,8 @@ def _amplitudes(u, nodes, shapes, v):  # type: ignore[no-untyped-def]
 
 
 @njit(**OPTIONS)
-def _spread(A, shapes, sign, out):  # type: ignore[no-untyped-def]
-    """Out (8, 3): sign times the transpose of `_amplitudes` of A (7, 3)."""
+def spread(A, shapes, sign, out):  # type: ignore[no-untyped-def]
+    """Out (8, 3): sign times the transpose of `amplitudes` of A (7, 3)."""
     for k in range(8):
         for i in range(3):
             total = 0.0
@@ -140,13 +132,13 @@ def _spread(A, shapes, sign, out):  # type: ignore[no-untyped-def]
 
 
 @njit(**OPTIONS)
-def _frames(u, cells, shapes, sizes):  # type: ignore[no-untyped-def]
+def frames(u, cells, shapes, sizes):  # type: ignore[no-untyped-def]
     """Amplitudes (cells, 7, 3), and signed SVDs of a F, one cell a lane."""
     F, U, V, B, W, s, _, _ = scratch(CHUNK)
     v = np.empty((CHUNK, 7, 3))
     for l in range(CHUNK):
         c = min(l, len(cells) - 1)
-        _amplitudes(u, cells[c], shapes[c], v[l])
+        amplitudes(u, cells[c], shapes[c], v[l])
         for i in range(3):
             for j in range(3):
                 F[3 * i + j, l] = v[l, j, i] + (sizes[c] if i == j else 0.0)
@@ -155,7 +147,7 @@ def _frames(u, cells, shapes, sizes):  # type: ignore[no-untyped-def]
 
 
 @njit(**OPTIONS)
-def _polar(U, s, V, l, size, cell):  # type: ignore[no-untyped-def]
+def polar(U, s, V, l, size, cell):  # type: ignore[no-untyped-def]
     """R, S and Y of lane l."""
     for i in range(3):
         for j in range(3):
@@ -170,24 +162,27 @@ def _polar(U, s, V, l, size, cell):  # type: ignore[no-untyped-def]
 
 @njit(**OPTIONS)
 def _rise(t, rate):  # type: ignore[no-untyped-def]
-    """From 0 at t = 0 to 1 at t = 1, and ``rate`` times its derivative."""
-    if t.real >= 1.0:
-        return 0.0 * t + 1.0, 0.0 * t
-    if not t.real > 0.0:
-        return 0.0 * t, 0.0 * t
-    return t * t * t * (10.0 - 15.0 * t + 6.0 * t * t), 30.0 * rate * (t * (1.0 - t)) ** 2
+    """From 0 at t = 0 to 1 at t = 1, with derivatives where t grows by ``rate``."""
+    if t >= 1.0:
+        return 1.0, 0.0, 0.0
+    if not t > 0.0:
+        return 0.0, 0.0, 0.0
+    both = t * (1.0 - t)
+    value = t * t * t * (10.0 - 15.0 * t + 6.0 * t * t)
+    return value, 30.0 * rate * both**2, 60.0 * rate**2 * both * (1.0 - 2.0 * t)
 
 
 @njit(**OPTIONS)
-def _strains(cell, size):  # type: ignore[no-untyped-def]
+def cell_strains(cell, size):  # type: ignore[no-untyped-def]
     """Make z, still without fading, and A.
 
-    Returns c and its derivative by A : dS, e and its by z . dz, and that of tr E / 3.
+    Returns c and its derivative by A : dS, e and its by z . dz, that of tr E / 3 by A : dS, and
+    the derivatives of these three.
     """
     v, R, S, A, z = cell.v, cell.R, cell.S, cell.A, cell.z
     for n in range(6):
-        i, j = _ROWS[n], _COLUMNS[n]
-        z[n] = S[i, j] - size if i == j else 2.0 * _ROOT * S[i, j]
+        i, j = ROWS[n], COLUMNS[n]
+        z[n] = S[i, j] - size if i == j else 2.0 * ROOT * S[i, j]
     for m in range(4):
         for i in range(3):
             z[6 + 3 * m + i] = R[0, i] * v[3 + m, 0] + R[1, i] * v[3 + m, 1] + R[2, i] * v[3 + m, 2]
@@ -195,37 +190,38 @@ def _strains(cell, size):  # type: ignore[no-untyped-def]
         j, k = (i + 1) % 3, (i + 2) % 3
         A[i, i] = S[j, j] * S[k, k] - S[j, k] * S[j, k]
         A[j, k] = A[k, j] = S[i, j] * S[i, k] - S[i, i] * S[j, k]
-    one = 1.0 / size  # complex numbers are slow to divide
+    one = 1.0 / size
     J = one**3 * (S[0, 0] * A[0, 0] + S[0, 1] * A[0, 1] + S[0, 2] * A[0, 2])
     over = 1.0 / (J * J + 2.0)
-    more = _THIRD * (1.5 * size * (J * J - 1.0) * over - (z[0] + z[1] + z[2]))
+    more = THIRD * (1.5 * size * (J * J - 1.0) * over - (z[0] + z[1] + z[2]))
     for i in range(3):
         z[i] += more
     grows = 3.0 * one**2 * J * over * over
-    c, slope = _rise((J - GONE) * _FADING, _FADING * one**3)
-    q = 0.0 * J
+    grows2 = 3.0 * one**5 * over * over * (1.0 - 4.0 * J * J * over)
+    c, slope, slope2 = _rise((J - GONE) * _FADING, _FADING * one**3)
+    q = 0.0
     for n in range(18):
         q += SHARES[n] * one**2 * (z[n] * z[n])
-    e, down = _rise((HUGE - q) * _SHRINKING, -2.0 * one**2 * _SHRINKING)
-    return c, slope, e, down, grows
+    e, down, down2 = _rise((HUGE - q) * _SHRINKING, -2.0 * one**2 * _SHRINKING)
+    return c, slope, e, down, grows, slope2, down2, grows2
 
 
 @njit(**OPTIONS)
-def _pull(cell, measures, out):  # type: ignore[no-untyped-def]
+def pull(cell, measures, out):  # type: ignore[no-untyped-def]
     """Out (7, 3): derivatives by v, R (T - [w]) transposed and R y_m, from those y by c e z."""
     _, R, S, Y, A, z, y, T, B, t, w = cell
-    c, slope, e, down, grows = measures
-    along = 0.0 * c
+    c, slope, e, down, grows, _, _, _ = measures
+    along = 0.0
     for n in range(18):
         along += y[n] * z[n]
     for n in range(18):  # by z
         y[n] = c * e * y[n] + along * c * down * SHARES[n] * z[n]
     trace = y[0] + y[1] + y[2]
     for n in range(6):  # T: by S
-        i, j = _ROWS[n], _COLUMNS[n]
-        T[i, j] = T[j, i] = y[n] if i == j else _ROOT * y[n]
+        i, j = ROWS[n], COLUMNS[n]
+        T[i, j] = T[j, i] = y[n] if i == j else ROOT * y[n]
     for i in range(3):
-        T[i, i] -= _THIRD * trace
+        T[i, i] -= THIRD * trace
         for j in range(3):
             T[i, j] += (trace * grows + along * slope * e) * A[i, j]
     _product(S, T, B)
@@ -247,40 +243,7 @@ def _pull(cell, measures, out):  # type: ignore[no-untyped-def]
 
 
 @njit(**OPTIONS)
-def _move(cell, dv, moved, D, turn):  # type: ignore[no-untyped-def]
-    """The cell after an imaginary step of amplitudes dv (7, 3), its z to be made; D (3, 3), turn
-    (3,) are room.
-    """
-    moved.R[:], moved.S[:], moved.Y[:] = cell.R, cell.S, cell.Y
-    for a in range(7):
-        for i in range(3):
-            moved.v[a, i] = complex(cell.v[a, i], _STEP * dv[a, i])
-    R, S, Y = cell.R, cell.S, cell.Y
-    for a in range(3):
-        for j in range(3):
-            D[j, a] = R[0, j] * dv[a, 0] + R[1, j] * dv[a, 1] + R[2, j] * dv[a, 2]
-    _axial(D, -1.0, cell.t)
-    _times(Y, cell.t, turn)
-    for j in range(3):
-        k, l = (j + 1) % 3, (j + 2) % 3
-        for m in range(3):
-            D[j, m] -= turn[k] * S[l, m] - turn[l] * S[k, m]
-            moved.R[m, j] += 1j * _STEP * (R[m, k] * turn[l] - R[m, l] * turn[k])
-    trace = D[0, 0] + D[1, 1] + D[2, 2]
-    for j in range(3):
-        for k in range(3):
-            change = 0.5 * (D[j, k] + D[k, j])
-            moved.S[j, k] += 1j * _STEP * change
-            cell.T[j, k] = (trace if j == k else 0.0) - change
-    _product(Y, cell.T, cell.B)
-    _product(cell.B, Y, cell.T)
-    for j in range(3):
-        for k in range(3):
-            moved.Y[j, k] -= 1j * _STEP * cell.T[j, k]
-
-
-@njit(**OPTIONS)
-def _stress(K, z, factor, out):  # type: ignore[no-untyped-def]
+def stress(K, z, factor, out):  # type: ignore[no-untyped-def]
     """Out (18,) = factor K z, for symmetric K, whose rows are added up."""
     for n in range(18):
         out[n] = 0.0
@@ -299,143 +262,35 @@ def energy_and_forces(  # type: ignore[no-untyped-def]
     For displacements u (N, 3), m; shapes (C, 7, 8), a b_k and g_mk; sizes (C,), a, m; matrices
     (C, 18, 18), K, N/m; shift (C, 18), N, or empty.
     """
-    cell, out = _cell(np.float64), np.empty((7, 3))
+    cell, out = new_cell(), np.empty((7, 3))
     for low in range(begin, end, CHUNK):
         high = min(end, low + CHUNK)
-        v, U, s, V = _frames(u, cells[low:high], shapes[low:high], sizes[low:high])
+        v, U, s, V = frames(u, cells[low:high], shapes[low:high], sizes[low:high])
         for c in range(low, high):
             cell.v[:] = v[c - low]
-            _polar(U, s, V, c - low, sizes[c], cell)
-            measures = _strains(cell, sizes[c])
+            polar(U, s, V, c - low, sizes[c], cell)
+            measures = cell_strains(cell, sizes[c])
             fades = measures[0] * measures[2]
-            _stress(matrices[c], cell.z, fades, cell.y)
+            stress(matrices[c], cell.z, fades, cell.y)
             total = 0.0
             for n in range(18):
                 less = shift[c, n] if len(shift) else 0.0
                 total += fades * cell.z[n] * (0.5 * cell.y[n] - less)
                 cell.y[n] -= less
             energy[c] = total
-            _pull(cell, measures, out)
-            _spread(out, shapes[c], -1.0, by_cell[c])
+            pull(cell, measures, out)
+            spread(out, shapes[c], -1.0, by_cell[c])
 
 
 @CellLoop
 def strains(begin, end, u, cells, shapes, sizes, out):  # type: ignore[no-untyped-def]
     """Z of each cell, out (C, 18), m."""
-    cell = _cell(np.float64)
+    cell = new_cell()
     for low in range(begin, end, CHUNK):
         high = min(end, low + CHUNK)
-        v, U, s, V = _frames(u, cells[low:high], shapes[low:high], sizes[low:high])
+        v, U, s, V = frames(u, cells[low:high], shapes[low:high], sizes[low:high])
         for c in range(low, high):
             cell.v[:] = v[c - low]
-            _polar(U, s, V, c - low, sizes[c], cell)
-            measures = _strains(cell, sizes[c])
+            polar(U, s, V, c - low, sizes[c], cell)
+            measures = cell_strains(cell, sizes[c])
             out[c] = measures[0] * measures[2] * cell.z
-
-
-@njit(**OPTIONS)
-def _change(cell, dv, size, K, y, measures, project, moved, room, out):  # type: ignore[no-untyped-def]
-    """Out (7, 3): how amplitudes dv (7, 3) change the derivatives by v; y (18,) are those by z."""
-    change, dz, dy, D, turn = room
-    _move(cell, dv, moved, D, turn)
-    after = _strains(moved, size)
-    fades = after[0] * after[2]
-    for n in range(18):
-        dz[n] = (fades * moved.z[n]).imag / _STEP
-    _stress(K, dz, 1.0, dy)
-    if project:
-        cell.y[:] = dy
-        _pull(cell, measures, out)
-        return
-    for n in range(18):
-        moved.y[n] = complex(y[n], _STEP * dy[n])
-    _pull(moved, after, change)
-    for a in range(7):
-        for i in range(3):
-            out[a, i] = change[a, i].imag / _STEP
-
-
-@njit(**OPTIONS)
-def _room():  # type: ignore[no-untyped-def]
-    """For `_change`."""
-    change = np.empty((7, 3), np.complex128)
-    return change, np.empty(18), np.empty(18), np.empty((3, 3)), np.empty(3)
-
-
-@njit(**OPTIONS)
-def _linearise(v, U, s, V, l, size, K, shift, cell, y):  # type: ignore[no-untyped-def]
-    """Make the cell of lane l and its y (18,), K z less ``shift``; its measures."""
-    cell.v[:] = v[l]
-    _polar(U, s, V, l, size, cell)
-    measures = _strains(cell, size)
-    _stress(K, cell.z, measures[0] * measures[2], y)
-    if len(shift):
-        y -= shift
-    return measures
-
-
-@CellLoop
-def tangents(  # type: ignore[no-untyped-def]
-    begin, end, u, cells, shapes, sizes, matrices, shift, project, out
-):
-    """Second derivatives of the same by the amplitudes v (7, 3) of the shapes, (C, 21, 21), N/m.
-
-    ``project`` leaves out what makes them indefinite where K is not.
-    """
-    cell, moved, room = _cell(np.float64), _cell(np.complex128), _room()
-    column, unit, y = np.empty((7, 3)), np.zeros((7, 3)), np.empty(18)
-    for low in range(begin, end, CHUNK):
-        high = min(end, low + CHUNK)
-        v, U, s, V = _frames(u, cells[low:high], shapes[low:high], sizes[low:high])
-        for c in range(low, high):
-            K, less, size = matrices[c], shift[c : c + 1].ravel(), sizes[c]
-            measures = _linearise(v, U, s, V, c - low, size, K, less, cell, y)
-            for a in range(7):
-                for i in range(3):
-                    unit[a, i] = 1.0
-                    _change(cell, unit, size, K, y, measures, project, moved, room, column)
-                    unit[a, i] = 0.0
-                    for b in range(7):
-                        for j in range(3):
-                            out[c, 3 * b + j, 3 * a + i] = column[b, j]
-
-
-@CellLoop
-def products(  # type: ignore[no-untyped-def]
-    begin, end, x, u, cells, shapes, sizes, matrices, shift, project, by_cell
-):
-    """The same second derivatives times x (N, 3), by cell, (C, 8, 3), N."""
-    cell, moved, room = _cell(np.float64), _cell(np.complex128), _room()
-    dv, out, y = np.empty((7, 3)), np.empty((7, 3)), np.empty(18)
-    for low in range(begin, end, CHUNK):
-        high = min(end, low + CHUNK)
-        v, U, s, V = _frames(u, cells[low:high], shapes[low:high], sizes[low:high])
-        for c in range(low, high):
-            K, less, size = matrices[c], shift[c : c + 1].ravel(), sizes[c]
-            measures = _linearise(v, U, s, V, c - low, size, K, less, cell, y)
-            _amplitudes(x, cells[c], shapes[c], dv)
-            _change(cell, dv, size, K, y, measures, project, moved, room, out)
-            _spread(out, shapes[c], 1.0, by_cell[c])
-
-
-@CellLoop
-def add_blocks(begin, end, tangent, shapes, blocks):  # type: ignore[no-untyped-def]
-    """Add the tangents (C, 21, 21) to cells' matrices (C, L, L, 3, 3) of nodes."""
-    half = np.empty((7, 3, 8, 3))
-    for c in range(begin, end):
-        for a in range(7):
-            for i in range(3):
-                for k in range(8):
-                    for j in range(3):
-                        total = 0.0
-                        for b in range(7):
-                            total += tangent[c, 3 * a + i, 3 * b + j] * shapes[c, b, k]
-                        half[a, i, k, j] = total
-        for l in range(8):
-            for k in range(8):
-                for i in range(3):
-                    for j in range(3):
-                        total = 0.0
-                        for a in range(7):
-                            total += shapes[c, a, l] * half[a, i, k, j]
-                        blocks[c, l, k, i, j] += total

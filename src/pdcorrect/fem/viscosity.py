@@ -30,7 +30,6 @@ from pdcorrect.fem.kernels import (
     deformation,
     nodal_forces,
     transform,
-    unit_change,
 )
 
 Array = NDArray[np.float64]
@@ -226,6 +225,20 @@ def _apply(  # type: ignore[no-untyped-def]
         nodal_forces(D, gradients[c], 1.0, by_cell[c])
 
 
+@njit(inline="always", **OPTIONS)
+def _unit_change(gradient, i, U, V, out):  # type: ignore[no-untyped-def]
+    """Out (9, Q) = U^T (e_i x grad N) V: the change of F by a shape function's component i."""
+    for a in range(3):
+        for b in range(3):
+            for q in range(out.shape[1]):
+                along = (
+                    V[b, q] * gradient[0, q]
+                    + V[3 + b, q] * gradient[1, q]
+                    + V[6 + b, q] * gradient[2, q]
+                )
+                out[3 * a + b, q] = U[3 * i + a, q] * along
+
+
 @CellLoop
 def _blocks(  # type: ignore[no-untyped-def]
     begin, end, gradients, left, right, values, weights, A, rate, project, out
@@ -239,7 +252,7 @@ def _blocks(  # type: ignore[no-untyped-def]
         _divided(values[c], D, Z)
         for k in range(width):
             for i in range(3):
-                unit_change(gradients[c, k], i, left[c], right[c], B)
+                _unit_change(gradients[c, k], i, left[c], right[c], B)
                 _change(values[c], Z, B, weights[c], rate, project, dS, dA, P)
                 transform(left[c], P, right[c], D, False)
                 nodal_forces(D, gradients[c], 1.0, column)

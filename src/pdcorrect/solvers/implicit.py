@@ -431,7 +431,7 @@ def _outcome(
     attached = [one.energy_and_forces(u, stage.end)[0] for one in problem.attached]
     momentum = problem.mass_times(after.velocities)
     stats = {
-        "elastic_energy": problem.energy_and_forces(end)[0] + sum(attached),
+        "elastic_energy": objective.elastic_energy(end) + sum(attached),
         "kinetic_energy": 0.5 * float(np.vdot(after.velocities, momentum)),
         "external_work": float(np.vdot(objective.loads, moved)),
         "clamp_work": float(np.vdot(reaction, moved)) / stage.load_factor,

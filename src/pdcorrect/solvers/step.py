@@ -66,6 +66,7 @@ class StepObjective:
         self.stage = stage
         self.free = problem.free_unknowns
         self.scale = 0.0
+        self._evaluated: tuple[Array | None, float] = (None, 0.0)
         self.start = problem.following(stage.start)
         self._extra = extra
         self.forces = self._forces(stage.start)
@@ -125,6 +126,7 @@ class StepObjective:
     def balance(self, y: Array) -> tuple[float, Array]:
         """Gamma (J) and its gradient on all components: where clamped, the clamps' forces."""
         energy, elastic = self.problem.energy_and_forces(y)
+        self._evaluated = y, energy
         offset = y - self._target
         gradient = self.problem.mass_times(offset)
         gradient *= self.stage.inertia
@@ -140,6 +142,11 @@ class StepObjective:
                 value, self.scale = value + loss, self.scale + loss
                 gradient += force
         return float(value), gradient
+
+    def elastic_energy(self, y: Array) -> float:
+        """The body's own energy at y, J; known where gamma was evaluated last."""
+        last, energy = self._evaluated
+        return energy if last is y else self.problem.energy_and_forces(y)[0]
 
     def carried(self, y: Array, gradient: Array) -> tuple[Array, Array]:
         """Y moved as a whole to where the forces on the body add up to its inertia.

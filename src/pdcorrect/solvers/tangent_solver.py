@@ -67,7 +67,7 @@ class TangentFactory:
     def factor_cost(self) -> float:
         """Cost of a band factorisation in iterations of L-BFGS with it."""
         iteration = 1e-4 + 1.6e-7 * self.problem.quadrature.weights.size + self._solve_seconds
-        assembly = 1e-3 + 5e-6 * len(self.problem.cells)
+        assembly = 3.3e-8 * self.problem.quadrature.lanes.size
         return (assembly + self._factor_seconds) / iteration
 
     @property
