@@ -10,7 +10,6 @@ from records import Rows, number, read
 
 RECORD = "benchmarks/results/rivals-amd-epyc-2cores.json"
 BEAM = "weight"
-BEAMS = BEAM, "weight, nu 0.45", "twist, nu 0.45"
 OURS = "ours"
 Row = dict[str, Any]
 ERROR, TIME = "error_percent", "cpu_ms_a_frame"
@@ -67,17 +66,6 @@ def of_beam() -> Rows:
     return ("run", *HEAD, "set-up, s"), cells
 
 
-def of_other_beams() -> Rows:
-    """The nearest run of each contestant in the two others."""
-    cells = []
-    for case in BEAMS[1:]:
-        rows = [row for row in found() if row["case"] == case]
-        for name, row in nearest(rows).items():
-            if name != OURS:
-                cells.append([case, label(row), *beside(rows, row)])
-    return ("case", "run", *HEAD), cells
-
-
 def nearest(rows: list[Row]) -> dict[str, Row]:
     """Of each contestant."""
     return {
@@ -106,7 +94,7 @@ def ratios(rows: list[Row], run: list[Row], what: str, other: str) -> str:
 
 def of_scenes() -> Rows:
     """Errors and times of each run in the scenes, and beside ours, in the median."""
-    rows = [row for row in found() if row["case"] not in BEAMS]
+    rows = [row for row in found() if row["case"] != BEAM]
     cells = []
     for name in dict.fromkeys(label(row) for row in rows):
         run = [row for row in rows if label(row) == name]
@@ -144,6 +132,6 @@ def left_out() -> Rows:
 def tables() -> Iterable[tuple[str, Any]]:
     """Names of the tables here and what makes them."""
     yield from {
-        "rivals-weight": of_beam, "rivals-beams": of_other_beams, "rivals-nearest": short,
+        "rivals-weight": of_beam, "rivals-nearest": short,
         "rivals-scenes": of_scenes, "rivals-left-out": left_out,
     }.items()  # fmt: skip

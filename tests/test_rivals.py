@@ -33,7 +33,13 @@ def made(modules, tmp_path):
 
 @pytest.mark.parametrize(
     ("name", "refine"),
-    [("weight", 2), ("twist, nu 0.45", 1), ("hard and soft", 1), ("impulse", 1), ("torsion", 1)],
+    [
+        ("weight", 2),
+        ("cross under torsion", 1),
+        ("hard and soft", 1),
+        ("impulse", 1),
+        ("torsion", 1),
+    ],
 )
 def test_both_sides_have_the_same_nodes_mass_and_loads(made, name, refine):
     body, problem = made(name, refine)

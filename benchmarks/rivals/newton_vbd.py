@@ -16,9 +16,9 @@ RECOMMENDED = ("1.67 ms, 10 iterations",)
 SETTINGS = {
     f"{1e3 * step:.3g} ms, {iterations} iterations": {
         "law": "neo-hookean", "longest": step, "iterations": iterations, "refine": (1,),
-        "scenes": (1,),
+        "scenes": scenes,
     }
-    for step, iterations in ((1 / 600, 10), (1 / 600, 100))
+    for step, iterations, scenes in ((1 / 600, 10, (1,)), (1 / 600, 100, ()))
 }  # fmt: skip
 
 

@@ -131,7 +131,7 @@ def main() -> None:
                 cases.write(SCENES[case], refine, Path(folder) / f"{refine}.npz")
             for name, python in pythons.items():
                 for setting, settings in importlib.import_module(name).SETTINGS.items():
-                    key = "refine" if case in cases.BEAMS else "scenes"
+                    key = "refine" if case == cases.NAME else "scenes"
                     for refine in settings[key]:
                         rows.append(measured(python, name, case, setting, refine, Path(folder)))
                         print(rows[-1], flush=True)
