@@ -120,9 +120,9 @@ def left_out() -> Rows:
     for row in record["results"]:
         if "failed" in row:
             reason = row["failed"].removeprefix("NotImplementedError: ")
-            key = label(row) if reason == row["failed"] else row["contestant"]
-            if reason.startswith("cells"):
-                key = label(row).split(",")[0] + (", mesh 1" if row["refine"] == 1 else ", 2x2x2")
+            key = row["contestant"]
+            if reason == row["failed"] or reason.startswith("cells"):
+                key = label(row)  # of this setting only
             reasons.setdefault((key, reason), []).append(row["case"])
     return ("contestant", "reason", "scenes"), [
         [*key, ", ".join(dict.fromkeys(cases))] for key, cases in reasons.items()

@@ -112,20 +112,18 @@ def main() -> None:
     chosen = parser.parse_args()
     os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
     warnings.simplefilter("ignore", PdcorrectWarning)
-    record = machine_file.read(NAME, PREFIX)
-    rows, versions = record.get("results", []), record.get("versions", {})
     pythons = {name: chosen.folder.absolute() / name / "bin/python" for name in chosen.only}
     pythons = {name: python for name, python in pythons.items() if python.exists()}
     if "ours" in chosen.only:
         pythons["ours"] = Path(sys.executable)
     print("left out:", *sorted({*chosen.only} - {*pythons}))
-    versions |= {name: version(python, name) for name, python in pythons.items()}
+    versions = {name: version(python, name) for name, python in pythons.items()}
     refused = {name: cases.refusal(scene) for name, scene in SCENES.items()}
     refused = {name: reason for name, reason in refused.items() if reason}
     for case in chosen.cases:
-        rows = [row for row in rows if row["contestant"] not in pythons or row["case"] != case]
         if case in refused:
             continue
+        found = []
         with tempfile.TemporaryDirectory() as folder:
             for refine in REFINE:
                 cases.write(SCENES[case], refine, Path(folder) / f"{refine}.npz")
@@ -133,9 +131,17 @@ def main() -> None:
                 for setting, settings in importlib.import_module(name).SETTINGS.items():
                     key = "refine" if case == cases.NAME else "scenes"
                     for refine in settings[key]:
-                        rows.append(measured(python, name, case, setting, refine, Path(folder)))
-                        print(rows[-1], flush=True)
-        machine_file.add(NAME, rows, prefix=PREFIX, versions=versions, refused=refused)
+                        found.append(measured(python, name, case, setting, refine, Path(folder)))
+                        print(found[-1], flush=True)
+        record = machine_file.read(NAME, PREFIX)  # another run may have added to it
+        rows = [
+            row
+            for row in record.get("results", [])
+            if row["contestant"] not in pythons or row["case"] != case
+        ]
+        versions = record.get("versions", {}) | versions
+        more = {"versions": versions, "refused": refused}
+        machine_file.add(NAME, rows + found, prefix=PREFIX, **more)
 
 
 if __name__ == "__main__":
