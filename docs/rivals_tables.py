@@ -95,15 +95,20 @@ def ratios(rows: list[Row], run: list[Row], what: str, other: str) -> str:
 def of_scenes() -> Rows:
     """Errors and times of each run in the scenes, and beside ours, in the median."""
     rows = [row for row in found() if row["case"] != BEAM]
-    cells = []
-    for name in dict.fromkeys(label(row) for row in rows):
-        run = [row for row in rows if label(row) == name]
+    cells, runs = (
+        [],
+        [
+            [row for row in rows if label(row) == name]
+            for name in {label(row): None for row in rows}
+        ],
+    )
+    for run in sorted(runs, key=lambda run: median(row[ERROR] for row in run)):
         beside = ["", ""]
         if run[0]["contestant"] != OURS:
             beside = [ratios(rows, run, TIME, ERROR), ratios(rows, run, ERROR, TIME)]
         errors, times = ([row[key] for row in run] for key in (ERROR, TIME))
         cells.append([
-            name, str(len(run)), *(number(x, 2) for x in (median(errors), max(errors))),
+            label(run[0]), str(len(run)), *(number(x, 2) for x in (median(errors), max(errors))),
             number(median(times), 2), *beside,
         ])  # fmt: skip
     head = ("run", "scenes", "error, %: median", "worst", "CPU ms a frame, median",
@@ -121,8 +126,10 @@ def left_out() -> Rows:
         if "failed" in row:
             reason = row["failed"].removeprefix("NotImplementedError: ")
             key = row["contestant"]
-            if reason == row["failed"] or reason.startswith("cells"):
-                key = label(row)  # of this setting only
+            if reason == row["failed"]:
+                key = label(row)
+            elif reason.startswith("cells"):
+                key = label(row).split(",")[0] + ", not 2x2x2"
             reasons.setdefault((key, reason), []).append(row["case"])
     return ("contestant", "reason", "scenes"), [
         [*key, ", ".join(dict.fromkeys(cases))] for key, cases in reasons.items()
