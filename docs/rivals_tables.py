@@ -95,14 +95,11 @@ def ratios(rows: list[Row], run: list[Row], what: str, other: str) -> str:
 def of_scenes() -> Rows:
     """Errors and times of each run in the scenes, and beside ours, in the median."""
     rows = [row for row in found() if row["case"] != BEAM]
-    cells, runs = (
-        [],
-        [
-            [row for row in rows if label(row) == name]
-            for name in {label(row): None for row in rows}
-        ],
-    )
-    for run in sorted(runs, key=lambda run: median(row[ERROR] for row in run)):
+    cells = []
+    runs: dict[str, list[Row]] = {}
+    for row in rows:
+        runs.setdefault(label(row), []).append(row)
+    for run in sorted(runs.values(), key=lambda run: median(row[ERROR] for row in run)):
         beside = ["", ""]
         if run[0]["contestant"] != OURS:
             beside = [ratios(rows, run, TIME, ERROR), ratios(rows, run, ERROR, TIME)]
