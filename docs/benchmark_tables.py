@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from functools import partial
+from collections.abc import Iterable
 from typing import Any
 
 from records import Rows, number, read
@@ -173,86 +172,10 @@ def reading() -> Rows:
     return ("first epoch", "from memory"), rows
 
 
-RIVALS = f"{RESULTS}/rivals-intel-r-xeon-r-processor-2cores.json"
-
-
-def rivals(case: str) -> Rows:
-    """Runs that no other of the same contestant and law beats in both error and time."""
-    rows = [row for row in results_of(RIVALS, "rivals") if row["case"] == case]
-    good = [row for row in rows if "failed" not in row]
-    kept = [
-        row
-        for row in good
-        if not any(
-            (other["contestant"], other["law"]) == (row["contestant"], row["law"])
-            and other["error_percent"] < row["error_percent"]
-            and other["cpu_ms_a_frame"] < row["cpu_ms_a_frame"]
-            for other in good
-        )
-    ]
-    cells = [
-        [
-            _rival(row), number(row["error_percent"], 2), number(row["cpu_ms_a_frame"], 2),
-            ", ".join(number(x, 2) for x in row["error_over_time_percent"]),
-            number(row["setup_s"], 2),
-        ]
-        for row in sorted(kept, key=lambda row: row["error_percent"])
-    ]  # fmt: skip
-    head = ("run, mesh", "error, %", "CPU ms a frame", "error by quarter of the time, %",
-            "set-up, s")  # fmt: skip
-    return head, cells
-
-
-def nearest_rivals() -> Rows:
-    """The nearest run of each contestant under weight."""
-    nearest: dict[str, Sequence[str]] = {}
-    head, rows = rivals("weight")
-    for row in rows:
-        nearest.setdefault(row[0].split(":")[0], row[:3])
-    return head[:3], list(nearest.values())
-
-
-def equal() -> Rows:
-    """Our cheapest run at a rival's error and our nearest in its time, by case and contestant."""
-    rows = [row for row in results_of(RIVALS, "rivals") if "failed" not in row]
-    ours = [row for row in rows if row["contestant"] == "ours"]
-    cells = []
-    for case, name in sorted({(row["case"], row["contestant"]) for row in rows}):
-        found = [row for row in rows if (row["case"], row["contestant"]) == (case, name)]
-        nearest = min(found, key=lambda row: row["error_percent"])
-        for row in (
-            ()
-            if name == "ours"
-            else [
-                *(x for x in found if x["recommended"] and x["refine"] == 1 and x is not nearest),
-                nearest,
-            ]
-        ):
-            same = [x for x in ours if x["case"] == case and x["law"] == row["law"]]
-            near = [x["cpu_ms_a_frame"] for x in same if x["error_percent"] <= row["error_percent"]]
-            quick = [
-                x["error_percent"] for x in same if x["cpu_ms_a_frame"] <= row["cpu_ms_a_frame"]
-            ]
-            cells.append([
-                case, _rival(row) + (" (recommended)" if row["recommended"] else ""),
-                number(row["error_percent"], 2), number(row["cpu_ms_a_frame"], 2),
-                number(min(near, default=None), 2), number(min(quick, default=None), 2),
-            ])  # fmt: skip
-    head = ("case", "run, mesh", "error, %", "CPU ms a frame", "ours, ms at that error",
-            "ours, % in that time")  # fmt: skip
-    return head, cells
-
-
-def _rival(row: dict[str, Any]) -> str:
-    return f"{row['contestant']}: {row['setting']}, {row['refine']}"
-
-
 def tables() -> Iterable[tuple[str, Any]]:
     """Names of the tables here and what makes them."""
     yield from {
         "peer": peer, "derivatives": derivatives, "integrators": integrators, "batches": batches,
         "batch-elements": batch_elements, "elements": elements,
         "corrected-steps": corrected_steps, "networks": networks, "reading": reading,
-        "rivals-weight": partial(rivals, "weight"), "rivals-nearest": nearest_rivals,
-        "rivals-equal": equal,
     }.items()  # fmt: skip

@@ -7,8 +7,9 @@ writes what `TABLES[NAME]` gives between the two lines, in every Markdown file o
     python docs/tables.py --check   # exit 1 if a page would change
 
 A table is a function without arguments that returns the header's cells and the rows' cells; those
-of models are in `model_tables`, those of pages in `page_tables`, those of cases about time in
-`time_tables` and `break_even_tables`, and what all use in `records`.
+of models are in `model_tables`, those of other simulators in `rivals_tables`, those of pages in
+`page_tables`, those of cases about time in `time_tables` and `break_even_tables`, and what all use
+in `records`.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ import benchmark_tables
 import break_even_tables
 import model_tables
 import page_tables
+import rivals_tables
 import time_tables
 from records import ROOT, Rows
 
@@ -36,6 +38,7 @@ _SKIPPED = {".git", ".venv", "node_modules", "_build"}
 TABLES: dict[str, Callable[[], Rows]] = {
     **dict(model_tables.tables()),
     **dict(benchmark_tables.tables()),
+    **dict(rivals_tables.tables()),
     **dict(page_tables.tables()),
     **dict(time_tables.tables()),
     **dict(break_even_tables.tables()),

@@ -1,81 +1,127 @@
-"""The beam that all contestants simulate, and how a contestant is run; NumPy only.
+"""A scene on one mesh as contestants read it, and how they are run; NumPy only.
 
-A contestant is a script with ``SETTINGS``: by name the material law, the meshes (``refine``) and
-further arguments of its ``simulate(case, law, ...)``, which yields the positions of ``case.points``
-after each frame.  It runs in the environment of its library:
+A contestant is a script with ``SETTINGS``: by name the material law, the meshes of the beam
+(``refine``) and of other ``scenes``, and further arguments of its ``simulate(case, law, ...)``,
+which yields the positions of ``case.points`` after each frame.  It runs in the environment of its
+library, on a file that `cases.write` made:
 
-    python SCRIPT CASE SETTING REFINE OUT.npz
+    python SCRIPT CASE.npz SETTING OUT.npz
 """
 
 from __future__ import annotations
 
+import math
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 Array = np.ndarray
-COUNTS, SIZE = (12, 2, 2), 0.04
-"""Coarse cells along x, y, z, and their edge, m."""
-DENSITY, GRAVITY, STEP, FRAMES = 1e3, 9.81, 0.01, 60
-"""kg/m3, m/s2 along -z, s."""
-TWIST = 3e4
-"""N/m3, of a body force about the axis of the beam."""
-CASES: dict[str, dict[str, Any]] = {
-    "weight": {"young": 1e6, "poisson": 0.3},
-    "weight, nu 0.45": {"young": 1e6, "poisson": 0.45},
-    "twist, nu 0.45": {"young": 1e6, "poisson": 0.45, "twist": TWIST},
-}
-"""Young's modulus, Pa, Poisson's ratio, and twisting force in place of gravity."""
-_CORNERS = np.array(
-    [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]]
-)
+PARTS = 120
+"""Of a frame, for which mean amplitudes of loads are given: what steps a frame divide."""
+MESHES = "refine", "scenes"
 _EVEN = np.array([[0, 2, 5, 7], [1, 0, 2, 5], [3, 0, 2, 7], [4, 0, 5, 7], [6, 2, 5, 7]])
 _ODD = np.array([[1, 3, 4, 6], [0, 1, 3, 4], [2, 1, 3, 6], [5, 1, 4, 6], [7, 3, 4, 6]])
 
+_FACES = np.array(
+    [[0, 4, 7, 3], [1, 2, 6, 5], [0, 1, 5, 4], [3, 7, 6, 2], [0, 3, 2, 1], [4, 5, 6, 7]]
+)
+
 
 class Case:
-    """A beam of ``refine`` cells along each edge of a coarse one, clamped at x = 0.
+    """A body of C equal cubic cells with N nodes, SI units.
 
-    ``points`` (N, 3), m; ``cells`` (C, 8) in VTK order; ``tets`` (5 C, 4), alternately cut so that
-    neighbours fit, of positive volume; ``coarse`` indices of the coarse nodes; ``clamped`` too.
+    Attributes
+    ----------
+    points : (N, 3)
+    cells : (C, 8)
+        VTK order.
+    coarse, clamped
+        Numbers of the coarse mesh's nodes, in its order, and of the held ones.
+    young, poisson, density : (C,)
+    velocity : (3,)
+        At time 0, of all but the clamped nodes.
+    accelerations, densities, twists : (L, 3), (L, C, 3), (L, 6)
+        Of each load: acceleration of the body, force density N/m3 in its cells, and field
+        (strength N/m3, attraction, stretch, centre) of a scene's torsion.
+    nodal : (L, N, 3)
+        Nodal forces of ``densities`` and ``twists`` on trilinear hexahedra, N.
+    amplitudes : (L, (frames + 1) PARTS)
+        Mean amplitudes in parts of the frames.
+    step, frames
+        Of a frame, s, and how many.
+    scene, refine
+        The scene as TOML and cells along each edge of a coarse one, for this package's own runs.
     """
 
-    def __init__(self, name: str, refine: int = 1) -> None:
-        self.name, self.refine = name, refine
-        values = CASES[name]
-        self.young, self.poisson = values["young"], values["poisson"]
+    points: Array
+    cells: Array
+    coarse: Array
+    clamped: Array
+    young: Array
+    poisson: Array
+    density: Array
+    velocity: Array
+    accelerations: Array
+    densities: Array
+    twists: Array
+    nodal: Array
+    amplitudes: Array
+
+    def __init__(self, path: str | Path) -> None:
+        with np.load(path) as found:
+            for key in found:
+                setattr(self, key, found[key])
+        self.step, self.scene, self.refine = float(self.step), str(self.scene), int(self.refine)
+        self.frames = self.amplitudes.shape[1] // PARTS - 1
         self.mu = self.young / (2 * (1 + self.poisson))
         self.lam = 2 * self.mu * self.poisson / (1 - 2 * self.poisson)
-        self.twist = values.get("twist", 0.0)
-        self.gravity = np.array([0.0, 0.0, 0.0 if self.twist else -GRAVITY])
-        self.density, self.step, self.frames = DENSITY, STEP, FRAMES
-        self.counts, self.size = tuple(refine * n for n in COUNTS), SIZE / refine
-        grid = np.stack(np.meshgrid(*(np.arange(n + 1) for n in self.counts), indexing="ij"), -1)
-        self.grid = grid.reshape(-1, 3)
-        self.points = self.size * self.grid
-        self.coarse = np.flatnonzero((self.grid % refine == 0).all(axis=1))
-        self.clamped = np.flatnonzero(self.grid[:, 0] == 0)
+        self.size = float(self.points[self.cells[0, 1], 0] - self.points[self.cells[0, 0], 0])
 
-    def number(self, grid: Array) -> Array:
-        """Of the nodes with places (..., 3) in the grid."""
-        _, ny, nz = self.counts
-        return (grid[..., 0] * (ny + 1) + grid[..., 1]) * (nz + 1) + grid[..., 2]
+    def substeps(self, longest: float) -> int:
+        """Steps a frame of at most so many seconds."""
+        return math.ceil(self.step / longest - 1e-9)
+
+    def factors(self, substeps: int, at: float = 0.5) -> Array:
+        """Mean amplitude of each load in each step, (frames, substeps, L).
+
+        Over a step's length around the time ``at`` which the step's equation holds, as a share of
+        it: so an impulse keeps its momentum.
+        """
+        length = PARTS / substeps
+        middles = (np.arange(self.frames * substeps) + at) * length
+        sums = np.pad(self.amplitudes.cumsum(axis=1), [(0, 0), (1, 0)])
+        first, last = (
+            [np.interp(middles + end, np.arange(sums.shape[1]), row) for row in sums]
+            for end in (-0.5 * length, 0.5 * length)
+        )
+        means = (np.array(last) - first) / length
+        return means.T.reshape(self.frames, substeps, len(sums))
+
+    @property
+    def steady(self) -> bool:
+        """Whether no load changes."""
+        return bool(np.ptp(self.amplitudes, axis=1).max(initial=0.0) == 0.0)
+
+    def uniform(self, values: Array) -> float:
+        """The one value of all cells."""
+        if np.ptp(values):
+            raise NotImplementedError("several materials")
+        return float(values[0])
 
     @cached_property
     def low(self) -> Array:
         """Place (C, 3) of each cell's lowest corner in the grid."""
-        return self.grid[(self.grid < self.counts).all(axis=1)]
-
-    @cached_property
-    def cells(self) -> Array:
-        return self.number(self.low[:, None] + _CORNERS)
+        corner = self.points[self.cells[:, 0]] - self.points.min(axis=0)
+        return np.rint(corner / self.size).astype(int)
 
     @cached_property
     def tets(self) -> Array:
+        """Five tetrahedra of each cell (5 C, 4) of positive volume; neighbours fit."""
         odd = self.low.sum(axis=1) % 2 == 1
         cuts = np.where(odd[:, None, None], _ODD, _EVEN)
         tets = np.take_along_axis(self.cells[:, None], cuts, axis=2).reshape(-1, 4)
@@ -83,36 +129,43 @@ class Case:
         tets[np.linalg.det(edges) < 0] = tets[np.linalg.det(edges) < 0][:, [0, 1, 3, 2]]
         return tets
 
-    @cached_property
-    def lumped(self) -> Array:
-        """Nodal masses (N,) of the hexahedra, kg."""
-        share = self.density * self.size**3 / 8
-        return np.bincount(self.cells.ravel(), minlength=len(self.points)) * share
+    @property
+    def owners(self) -> Array:
+        """The cell of each tetrahedron."""
+        return np.repeat(np.arange(len(self.cells)), 5)
 
-    def force_density(self, points: Array) -> Array:
-        """Body force (..., 3) at points, N/m3, without gravity."""
-        across = points[..., 1:] - 0.5 * SIZE * np.array(COUNTS[1:])
-        turned = np.stack([0 * across[..., 0], -across[..., 1], across[..., 0]], axis=-1)
-        radius = np.linalg.norm(across, axis=-1, keepdims=True)
-        return self.twist * turned / np.where(radius == 0, 1, radius)
+    def force_density(self, load: int, points: Array, cells: Array) -> Array:
+        """Of a load at points (..., 3) in cells (...), gravity included, N/m3."""
+        strength, attraction, stretch, *centre = self.twists[load]
+        _, y, z = np.moveaxis(points - centre, -1, 0)
+        field = np.stack([stretch + 0 * y, -z - attraction * y, y - attraction * z], axis=-1)
+        length = np.linalg.norm(field, axis=-1, keepdims=True)
+        uniform = self.densities[load] + self.density[:, None] * self.accelerations[load]
+        return uniform[cells] + strength * field / np.where(length == 0, 1, length)
 
-    @cached_property
-    def forces(self) -> Array:
-        """Nodal forces (N, 3) of the twist, integrated over the hexahedra, N."""
-        places = (_CORNERS - 0.5) / np.sqrt(3) + 0.5
-        shapes = np.abs(1 - _CORNERS - places[:, None]).prod(axis=2)  # (point, node)
-        at = self.points[self.cells[:, 0]][:, None] + self.size * places
-        parts = np.einsum("qn,cqd->cnd", shapes, self.force_density(at)) * self.size**3 / 8
-        total = np.zeros_like(self.points)
-        np.add.at(total, self.cells, parts)
-        return total
+    def held(self, points: Array) -> Array:
+        """Which points (M, 3) lie on faces of cells whose four corners are clamped."""
+        faces = self.cells[:, _FACES]
+        faces = self.points[faces[np.isin(faces, self.clamped).all(axis=2)]]
+        low, high = (end(faces, axis=1) for end in (np.min, np.max))
+        near = 1e-6 * self.size
+        inside = (points[:, None] > low - near) & (points[:, None] < high + near)
+        return inside.all(axis=2).any(axis=1)
 
     def match(self, points: Array) -> Array:
         """Indices of this case's points among ``points`` (M, 3)."""
         places = {
             tuple(row): k for k, row in enumerate(np.rint(4 * points / self.size).astype(int))
         }
-        return np.array([places[tuple(4 * row)] for row in self.grid])
+        return np.array([places[tuple(row)] for row in np.rint(4 * self.points / self.size)])
+
+
+def with_middles(points: Array, tets: Array) -> tuple[Array, Array]:
+    """Points and tetrahedra of ten nodes, Abaqus's order."""
+    ends = np.sort(tets[:, [[0, 1], [1, 2], [2, 0], [0, 3], [1, 3], [2, 3]]], axis=2)
+    edges, numbers = np.unique(ends.reshape(-1, 2), axis=0, return_inverse=True)
+    middles = numbers.reshape(-1, 6) + len(points)
+    return np.concatenate([points, points[edges].mean(axis=1)]), np.hstack([tets, middles])
 
 
 def main(
@@ -122,10 +175,10 @@ def main(
 
     The first frame's seconds hold all set-up too: imports, meshing, compilation.
     """
-    name, setting, refine, out = sys.argv[1:]
-    case = Case(name, int(refine))
+    path, setting, out = sys.argv[1:]
+    case = Case(path)
     wall, cpu, frames = [time.perf_counter()], [time.process_time()], [case.points[case.coarse]]
-    chosen = {key: value for key, value in settings[setting].items() if key != "refine"}
+    chosen = {key: value for key, value in settings[setting].items() if key not in MESHES}
     for positions in simulate(case, **chosen):
         wall.append(time.perf_counter())
         cpu.append(time.process_time())

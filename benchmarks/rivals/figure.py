@@ -1,4 +1,4 @@
-"""Draw errors against times of all contestants in a case: python figure.py RECORD.json OUT.png"""
+"""Draw errors against times of all simulators under weight: python figure.py RECORD.json OUT.png"""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ CASE = "weight"
 
 def main() -> None:
     record, out = sys.argv[1:]
-    points: dict[str, list[tuple[float, float]]] = {}
+    points: dict[str, list[tuple[float, float]]] = {"ours": []}
     for row in json.loads(Path(record).read_text(encoding="utf-8"))["rivals"]["results"]:
         if row["case"] == CASE and "failed" not in row:
             point = 1e-3 * row["cpu_ms_a_frame"], 1e-2 * row["error_percent"]
-            points.setdefault(row["contestant"], []).append(point)
+            points.setdefault(row["contestant"].split("_")[0], []).append(point)
     named = {name: tuple(np.array(found).T) for name, found in points.items()}
     plot_error_against_time(named, out, relative=True)
 

@@ -14,39 +14,44 @@ from case import Case, main
 PACKAGE = "newton"
 RECOMMENDED = ("1.67 ms, 10 iterations",)
 SETTINGS = {
-    f"{10 / substeps:.3g} ms, {iterations} iterations": {
-        "law": "neo-hookean", "substeps": substeps, "iterations": iterations, "refine": refine,
+    f"{1e3 * step:.3g} ms, {iterations} iterations": {
+        "law": "neo-hookean", "longest": step, "iterations": iterations, "refine": (1,),
+        "scenes": scenes,
     }
-    for substeps, iterations, refine in ((6, 10, (1, 2)), (6, 100, (1,)), (24, 30, (1,)))
+    for step, iterations, scenes in ((1 / 600, 10, (1,)), (1 / 600, 100, ()))
 }  # fmt: skip
 
 
-def simulate(case: Case, law: str, substeps: int, iterations: int) -> Iterator[np.ndarray]:
+def simulate(case: Case, law: str, longest: float, iterations: int) -> Iterator[np.ndarray]:
     import newton
     import warp as wp
 
+    substeps = case.substeps(longest)
+
     builder = newton.ModelBuilder()
     builder.add_soft_mesh(
-        pos=wp.vec3(0.0, 0.0, 0.0), rot=wp.quat_identity(), scale=1.0, vel=wp.vec3(0.0, 0.0, 0.0),
+        pos=wp.vec3(0.0, 0.0, 0.0), rot=wp.quat_identity(), scale=1.0, vel=wp.vec3(*case.velocity),
         vertices=[wp.vec3(*point) for point in case.points], indices=case.tets.ravel().tolist(),
-        density=case.density, k_mu=case.mu, k_lambda=case.lam, k_damp=0.0,
-        add_surface_mesh_edges=False,
+        density=case.uniform(case.density), k_mu=case.uniform(case.mu),
+        k_lambda=case.uniform(case.lam), k_damp=0.0, add_surface_mesh_edges=False,
     )  # fmt: skip
     for node in case.clamped:
-        builder.particle_mass[node] = 0.0
+        builder.particle_mass[node], builder.particle_qd[node] = 0.0, wp.vec3(0.0, 0.0, 0.0)
     builder.color()
     with wp.ScopedDevice("cpu"):
         model = builder.finalize()
-        model.set_gravity(tuple(case.gravity))
+        model.set_gravity((0.0, 0.0, 0.0))
         solver = newton.solvers.SolverVBD(
             model=model, iterations=iterations, particle_enable_self_contact=False,
             particle_enable_tile_solve=False,
         )  # fmt: skip
         now, then, control = model.state(), model.state(), model.control()
-        forces = wp.array(case.forces.astype(np.float32), dtype=wp.vec3)
-        for _ in range(case.frames):
-            for _ in range(substeps):
-                wp.copy(now.particle_f, forces)
+        mass = model.particle_mass.numpy()[:, None]
+        forces = case.nodal + mass * case.accelerations[:, None]
+        for frame in case.factors(substeps):
+            for factors in frame:
+                total = np.tensordot(factors, forces, 1).astype(np.float32)
+                wp.copy(now.particle_f, wp.array(total, dtype=wp.vec3))
                 solver.step(now, then, control, None, case.step / substeps)
                 now, then = then, now
             yield now.particle_q.numpy()

@@ -5,66 +5,41 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from case import COUNTS, FRAMES, GRAVITY, SIZE, STEP, Case, main
+from case import Case, main
 
 PACKAGE = "pdcorrect"
 RECOMMENDED = ()
-
-LAWS = ("linear-corotated", "neo-hookean")
-_KINDS = (
-    ("hex8", "generalised-alpha", 1, (1,)),
-    ("hex8-enhanced", "generalised-alpha", 1, (1, 2)),
-    ("hex8-learned", "backward-euler", 1, (1,)),
-    ("hex8-learned", "generalised-alpha", 1, (1,)),
-    ("hex8-learned", "generalised-alpha", 2, (1,)),
-    ("hex8-learned", "generalised-alpha", 4, (1,)),
-    ("hex27", "generalised-alpha", 1, (1,)),
-    ("hex27", "generalised-alpha", 2, (1,)),
-)
-"""Element, integrator, substeps, meshes."""
+_KINDS = {
+    "hex8, 1": ("hex8", 1, ()),
+    "best coarse, 1": ("hex8-enhanced", 1, (1,)),
+    "hex27, 1": ("hex27", 1, (1,)),
+    "learned, 1": ("hex8-learned", 1, (1,)),
+    "learned, 2": ("hex8-learned", 2, (1,)),
+}
+"""Element, steps a frame by generalised-alpha, meshes of scenes but the beam."""
 SETTINGS = {
-    f"{element}, {integrator}, {10 / substeps:g} ms, {law}": {
-        "law": law, "element": element, "integrator": integrator, "substeps": substeps,
-        "refine": refine,
+    f"{name}, {law}": {
+        "law": law, "element": element, "substeps": steps, "refine": (1,), "scenes": scenes,
     }
-    for law in LAWS
-    for element, integrator, substeps, refine in _KINDS
+    for law in ("linear-corotated", "neo-hookean")
+    for name, (element, steps, scenes) in _KINDS.items()
 }  # fmt: skip
 
 
-def scene(case: Case, law: str):  # type: ignore[no-untyped-def]
-    """The case as a scene."""
+def simulate(case: Case, law: str, element: str, substeps: int) -> Iterator[np.ndarray]:
     import pdcorrect as pc
 
-    load = {"kind": "gravity", "acceleration": [0.0, 0.0, -GRAVITY]}
-    if case.twist:
-        load = {"kind": "torsion", "strength": case.twist}
-    return pc.Scene(
-        name=case.name,
-        body={"shape": "beam", "cells": list(COUNTS), "cell_size": SIZE},
-        material={
-            "energy": law, "young": case.young, "poisson": case.poisson, "density": case.density,
-        },
-        time={"step": STEP, "frames": FRAMES},
-        clamps=[{"region": {"plane": "x", "at": 0.0}}],
-        loads=[load],
-    )  # fmt: skip
-
-
-def simulate(
-    case: Case, law: str, element: str, integrator: str, substeps: int
-) -> Iterator[np.ndarray]:
-    import pdcorrect as pc
-
-    chosen = scene(case, law).with_changes(time={"integrator": integrator, "substeps": substeps})
-    mass = {"hex8": "lumped", "hex27": "consistent"}
+    scene = pc.Scene.from_toml(case.scene).with_changes(
+        material={"energy": law}, time={"integrator": "generalised-alpha", "substeps": substeps}
+    )
     if element == "hex8-learned":
-        chosen = pc.learned_coarse(chosen)
+        scene = pc.learned_coarse(scene)
     elif element == "hex8-enhanced":
-        chosen = pc.best_coarse(chosen)
+        scene = pc.best_coarse(scene)
     else:
-        chosen = chosen.with_changes(solver={"element": element, "mass": mass[element]})
-    problem = pc.discretise(chosen, case.refine)
+        mass = "lumped" if element == "hex8" else "consistent"
+        scene = scene.with_changes(solver={"element": element, "mass": mass})
+    problem = pc.discretise(scene, case.refine)
     stepper = pc.ProjectiveDynamics(problem).prepare()
     state, own = problem.initial_state(), case.match(problem.positions)
     for _ in range(case.frames):

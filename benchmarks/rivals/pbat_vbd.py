@@ -14,36 +14,43 @@ from case import Case, main
 PACKAGE = "pbatoolkit"
 RECOMMENDED = ("10 ms, 20 iterations",)
 SETTINGS = {
-    f"{10 / substeps:g} ms, {iterations} iterations": {
-        "law": "neo-hookean", "substeps": substeps, "iterations": iterations, "refine": refine,
+    f"{1e3 * step:g} ms, {iterations} iterations": {
+        "law": "neo-hookean", "longest": step, "iterations": iterations, "refine": refine,
+        "scenes": (1,),
     }
-    for substeps, iterations, refine in ((1, 20, (1, 2)), (10, 20, (1, 2)), (10, 200, (1,)))
+    for step, iterations, refine in ((1e-2, 20, (1,)), (1e-3, 20, (1, 2)))
 }  # fmt: skip
 
 
-def simulate(case: Case, law: str, substeps: int, iterations: int) -> Iterator[np.ndarray]:
+def simulate(case: Case, law: str, longest: float, iterations: int) -> Iterator[np.ndarray]:
     from pbatoolkit import pbat
 
-    vbd, count = pbat.sim.vbd, len(case.tets)
-    forces, mass = case.forces.T, np.zeros(len(case.points))
+    vbd, mass, owners = pbat.sim.vbd, np.zeros(len(case.points)), case.owners
     edges = case.points[case.tets[:, 1:]] - case.points[case.tets[:, :1]]
-    np.add.at(mass, case.tets, (case.density / 24 * np.linalg.det(edges))[:, None])
+    shares = case.density[owners] / 24 * np.linalg.det(edges)
+    np.add.at(mass, case.tets, shares[:, None])
+    accelerations = case.accelerations[:, None] + case.nodal / mass[:, None]
+    accelerations[:, case.clamped] = 0
+    substeps = case.substeps(longest)
+    h = case.step / substeps
+    velocity = np.tile(case.velocity[:, None], len(case.points))
+    velocity[:, case.clamped] = 0
     data = (
         vbd.Data()
         .with_volume_mesh(case.points.T, case.tets.T)
         .with_surface_mesh(np.zeros(0, dtype=np.int64), np.zeros((3, 0), dtype=np.int64))
-        .with_acceleration(case.gravity[:, None] + forces / mass)
-        .with_material(
-            np.full(count, case.density), np.full(count, case.mu),
-            np.full(count, case.lam + case.mu),
-        )
+        .with_velocity(velocity)
+        .with_acceleration(np.zeros((3, len(case.points))))
+        .with_material(case.density[owners], case.mu[owners], (case.lam + case.mu)[owners])
         .with_dirichlet_vertices(case.clamped)
         .with_initialization_strategy(vbd.InitializationStrategy.KineticEnergyMinimum)
         .construct(validate=True)
-    )  # fmt: skip
+    )
     solver = vbd.Integrator(data)
-    for _ in range(case.frames):
-        solver.step(case.step, iterations, substeps)
+    for frame in case.factors(substeps):
+        for step in frame:
+            solver.v += h * np.tensordot(step, accelerations, 1).T  # as by its aext
+            solver.step(h, iterations, 1)
         yield solver.x.T
 
 
