@@ -199,7 +199,7 @@ def integrators() -> list[dict[str, Any]]:
 
 def elements() -> list[dict[str, Any]]:
     """A step with the learned element beside the best coarse one, two threads."""
-    sizes = ((2, 2, 24), (2, 8, 18), (8, 8, 24))
+    sizes = ((2, 2, 24), (2, 8, 18), (8, 8, 24), (8, 8, 96))
     return [
         {"threads": 2, "tolerance": 1e-5, **measure(2, "elements", width=a, height=b, length=c)}
         for a, b, c in sizes

@@ -607,6 +607,17 @@ def swallow(pipe):
         time.sleep(LIMIT)
 
 
+def closes(pipe):
+    with terminable():
+        try:
+            pipe.send("started")
+            time.sleep(LIMIT)
+        finally:
+            pipe.send("closing")
+            time.sleep(0.2)
+            pipe.send("closed")
+
+
 def test_a_second_sigterm_ends_what_has_lost_the_first(fork, monkeypatch):
     monkeypatch.setattr(_files, "_CLOSING", 0.1)
     copy = fork(swallow)
@@ -616,6 +627,16 @@ def test_a_second_sigterm_ends_what_has_lost_the_first(fork, monkeypatch):
     time.sleep(0.2)
     copy.terminate()
     assert copy.join() == -signal.SIGTERM
+
+
+def test_a_second_sigterm_is_ignored_while_files_are_closed(fork, monkeypatch):
+    monkeypatch.setattr(_files, "_CLOSING", LIMIT)
+    copy = fork(closes)
+    assert copy.recv() == "started"
+    copy.terminate()
+    assert copy.recv() == "closing"
+    copy.terminate()
+    assert copy.recv() == "closed"
 
 
 def test_a_run_on_a_full_disk_goes_on_when_there_is_room(program, fork, scene_file, tmp_path):

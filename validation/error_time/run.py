@@ -112,14 +112,15 @@ def kept(scene: pc.Scene, methods: Collection[str]) -> Path:
 
 
 def parts(quick: bool) -> dict[str, Callable[[], common.Outcome]]:
-    """A part for each scene, and one for the error of its converged motion."""
+    """A part for each scene, and for some one for the error of its converged motion."""
     if quick:
         scene = SCENES[QUICK].with_changes(time=FEW)
         return {QUICK: partial(of_scene, QUICK, scene, ESTIMATED)}
     found: dict[str, Callable[[], common.Outcome]] = {}
     for name, scene in scenes().items():
         found[name] = partial(of_scene, name, scene)
-        found[f"converged motion of {name}"] = partial(reference.of_scene, name, scene)
+        if name in reference.SCENES:
+            found[f"converged motion of {name}"] = partial(reference.of_scene, name, scene)
     return found
 
 
@@ -139,6 +140,11 @@ def summary(record: common.Record) -> common.Outcome:
         own = [row[k] for row in record.table(reference.OWN)["rows"]]
         figures[f"converged motions, {what}, mean, %"] = float(np.mean(own))
         figures[f"converged motions, {what}, worst, %"] = float(np.max(own))
+    table = record.table(reference.FINER)
+    for name, errors in zip(
+        table["headings"][1:], zip(*(row[1:] for row in table["rows"]), strict=True), strict=True
+    ):
+        figures[f"from the finest mesh, {name}, mean, %"] = float(np.mean(errors))
     beside, ratios = [], []
     for label, points in points_of(record).items():
         rivals = [point for point in points if point.name in RIVALS]

@@ -17,8 +17,8 @@ from pdcorrect.fem.cell_correction import CellCorrection
 class _State(NamedTuple):
     """Of each cell at a configuration, components first, (k, B C, 1): see `turned_strains`.
 
-    R, S, (tr S - S)^-1, S's adjugate, z before it fades, how it fades and what is left of it; then
-    the derivatives by that, those by S and z's vectors, w, and those by the shapes' amplitudes.
+    R, S, (tr S - S)^-1, S's adjugate, z before it fades and how it fades; then the derivatives by
+    what is left of z, those by S and z's vectors, and w.
     """
 
     R: Tensor
@@ -27,11 +27,9 @@ class _State(NamedTuple):
     adjugate: Tensor
     z: Tensor
     fades: Tensor
-    left: Tensor
     raw: Tensor
     y: Tensor
     w: Tensor
-    conjugates: Tensor
 
     @property
     def frame(self) -> list[Tensor]:
@@ -62,34 +60,37 @@ class BatchCorrection:
 
     def energy_and_forces(self, local: Tensor) -> tuple[Tensor, Tensor]:
         """J (B,) and N by cell (B, C, 8, 3) for displacements (B, C, 8, 3) of corners."""
-        return self._potential(self._state(local))
+        frame, left = self._frame(local)
+        stress = self.stress(left)
+        return self._energy(left, stress), -self._spread(self._with(frame, stress)[1])
 
     def strains(self, local: Tensor) -> Tensor:
         """What is left of z, (B, C, 18)."""
-        return self._by_cell(self._frame(local)[-1])
+        return self._frame(local)[1]
 
     def whole(self, local: Tensor) -> Tensor:
         """Whether z does not fade at all, (B, C, 1)."""
-        fades = self._by_cell(self._frame(local)[5])
+        fades = self._by_cell(self._frame(local)[0][5])
         return (fades[..., :1] == 1.0) & (fades[..., 5:6] == 1.0)
 
     def viscous(self, local: Tensor, before: Tensor, rate: Tensor) -> tuple[Tensor, Tensor]:
         """See `WrittenViscous`: (B,), and its derivatives by cell (B, C, 8, 3)."""
-        energy, forces = self._potential(self.linearise_viscous(local, before, rate), before)
-        return energy, -forces
+        frame, left = self._frame(local)
+        stress = self.viscous_stress(left - before, rate)
+        return self._energy(left - before, stress), self._spread(self._with(frame, stress)[1])
 
     def linearise_viscous(self, local: Tensor, before: Tensor, rate: Tensor) -> _State:
         """What `apply` needs of it, with the same rate."""
-        found = self._frame(local)
-        return self._with(found, self.viscous_stress(self._by_cell(found[-1]) - before, rate))
+        frame, left = self._frame(local)
+        return self._with(frame, self.viscous_stress(left - before, rate))[0]
 
     def rates(self, local: Tensor, x: Tensor) -> Tensor:
         """Change of what is left of z (B, C, 18) by displacements x (B, C, 8, 3)."""
-        return self._by_cell(self._rates(self._frame(local)[:-1], x)[-1])
+        return self._by_cell(self._rates(self._frame(local)[0], x)[-1])
 
     def pulled(self, local: Tensor, stress: Tensor) -> Tensor:
         """Derivatives of stress . z by the displacements, (B, C, 8, 3), for (B, C, 18)."""
-        return self._spread(self._with(self._frame(local), stress).conjugates)
+        return self._spread(self._with(self._frame(local)[0], stress)[1])
 
     def stress(self, z: Tensor) -> Tensor:
         """K z, (B, C, 18)."""
@@ -101,7 +102,8 @@ class BatchCorrection:
 
     def linearise(self, local: Tensor, project: bool = False) -> _State:
         """What `apply` needs; ``project`` as in `CellCorrection.tangent`."""
-        state = self._state(local)
+        frame, left = self._frame(local)
+        state, _ = self._with(frame, self.stress(left))
         if not project:
             return state
         own = {name: torch.zeros_like(getattr(state, name)) for name in ("raw", "y", "w")}
@@ -117,30 +119,26 @@ class BatchCorrection:
         (out,) = computed(turned_strains.changes, inputs, (21,), cell_by_cell=True)
         return self._spread(out)
 
-    def _frame(self, local: Tensor) -> list[Tensor]:
+    def _frame(self, local: Tensor) -> tuple[list[Tensor], Tensor]:
+        """See `_State.frame`; and what is left of z, (B, C, 18)."""
         v = _components(small_products(self._shapes, local))
         sizes = self._sizes.reshape(1, -1, 1)
-        return computed(turned_strains.frame, [v, sizes], (9, 9, 9, 9, 18, 8, 18))
+        *frame, left = computed(turned_strains.frame, [v, sizes], (9, 9, 9, 9, 18, 8, 18))
+        return frame, self._by_cell(left)
 
     def _rates(self, frame: list[Tensor], x: Tensor) -> list[Tensor]:
         dv = _components(small_products(self._shapes, x))
         return computed(turned_strains.rates, [*frame, dv], (18, 9, 1, 3, 18))
 
-    def _state(self, local: Tensor) -> _State:
-        found = self._frame(local)
-        return self._with(found, self.stress(self._by_cell(found[-1])))
-
-    def _with(self, found: list[Tensor], stress: Tensor) -> _State:
-        """The state with derivatives (B, C, 18) by what is left of z."""
+    def _with(self, frame: list[Tensor], stress: Tensor) -> tuple[_State, Tensor]:
+        """For derivatives (B, C, 18) by what is left of z; also those by the amplitudes."""
         raw = _components(stress)
-        after = computed(turned_strains.derivatives, [*found[:-1], raw], (18, 3, 21))
-        return _State(*(*found, raw, *after))
+        y, w, conjugates = computed(turned_strains.derivatives, [*frame, raw], (18, 3, 21))
+        return _State(*(*frame, raw, y, w)), conjugates
 
-    def _potential(self, at: _State, before: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Half of (z - before) . raw of each scene, and minus its derivatives."""
-        change = at.left if before is None else at.left - _components(before)
-        energy = 0.5 * (change * at.raw).sum(dim=0).reshape(len(self._sizes), -1).sum(dim=1)
-        return energy, -self._spread(at.conjugates)
+    def _energy(self, z: Tensor, stress: Tensor) -> Tensor:
+        """Half of their product, of each scene, (B,), J."""
+        return 0.5 * (z * stress).sum(dim=(1, 2))
 
     def _by_cell(self, x: Tensor) -> Tensor:
         """(k, B C, 1) as (B, C, k)."""

@@ -87,7 +87,7 @@ def deformation(rows: Tensor, gradients: Tensor) -> Tensor:
     """Displacement gradients (9, B C, Q) of cells, on a GPU.
 
     ``rows`` (B, C, 3, L) are displacements, ``gradients`` (B, L, 3 Q), or (B, C, L, 3 Q), those of
-    shape functions.  Matrix libraries take ten times as long for such small products.
+    shape functions.  One kernel: matrix libraries are made for larger products.
     """
     scenes, cells = rows.shape[:2]
     *several, width, _ = gradients.shape

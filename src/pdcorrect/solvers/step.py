@@ -124,7 +124,10 @@ class StepObjective:
         return energy, gradient
 
     def balance(self, y: Array) -> tuple[float, Array]:
-        """Gamma (J) and its gradient on all components: where clamped, the clamps' forces."""
+        """Gamma (J) and its gradient on all components: where clamped, the clamps' forces.
+
+        y must not change afterwards, see `elastic_energy`.
+        """
         energy, elastic = self.problem.energy_and_forces(y)
         self._evaluated = y, energy
         offset = y - self._target

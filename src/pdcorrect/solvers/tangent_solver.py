@@ -41,6 +41,8 @@ _CYCLE_SECONDS = 1.7e-8
 
 The cycle is cheaper on large meshes, but takes three to four times the iterations.
 """
+_TANGENT_SECONDS = 3.3e-8
+"""Of the cells' tangents, for each number of their shape functions' gradients (case newton)."""
 _LARGEST_BAND = 2e9
 """Bytes; fixed, so that machines of usual size make the same choice."""
 _SOLVES = 50
@@ -67,7 +69,7 @@ class TangentFactory:
     def factor_cost(self) -> float:
         """Cost of a band factorisation in iterations of L-BFGS with it."""
         iteration = 1e-4 + 1.6e-7 * self.problem.quadrature.weights.size + self._solve_seconds
-        assembly = 3.3e-8 * self.problem.quadrature.lanes.size
+        assembly = _TANGENT_SECONDS * self.problem.quadrature.lanes.size
         return (assembly + self._factor_seconds) / iteration
 
     @property
