@@ -10,7 +10,7 @@ import pdcorrect as pc
 from conftest import beam, box_mesh
 from pdcorrect.data.importing import portable
 from pdcorrect.errors import InputError, PdcorrectWarning, SceneError
-from pdcorrect.evaluation.converged import _key
+from pdcorrect.evaluation.converged import cache_key
 from pdcorrect.fem.mesh import coincident_nodes
 from pdcorrect.state import Status
 
@@ -101,9 +101,9 @@ def test_mesh_files_and_labels_have_groups_by_the_bodys_name(tmp_path):
         "1": [4],
         "2": [5, 6],
     }
-    key = _key(scene)
+    key = cache_key(scene)
     np.save(tmp_path / "b.npy", np.array([[[1, 2, 2, 2]]]))
-    assert _key(scene) != key  # what a file holds counts
+    assert cache_key(scene) != key  # what a file holds counts
 
 
 def test_each_body_is_held_in_statics():
