@@ -39,12 +39,12 @@ def used(tmp_path_factory):
 
 
 def test_the_volume_term_is_projected_where_there_is_one_and_at_its_own_points_only(used):
-    """At all points of hex8 in blocks of 32; of the mean elements at one point a cell."""
+    """At all points of hex8 in blocks of 64; of the mean elements at one point a cell."""
     counts = {name: one["counts"] for name, one in used.items()}
     assert counts["bare"]["volume"] > 0  # the kernel is called, for no lane
     assert counts["bare"]["volume lanes"] == 0
     for name in ("volume", "loaded"):
-        assert counts[name]["volume lanes"] == 32 * counts[name]["volume"]
+        assert counts[name]["volume lanes"] == 64 * counts[name]["volume"]
     for name in ("best", "full"):
         assert 0 < counts[name]["volume lanes"] <= 8 * counts[name]["volume"]
 

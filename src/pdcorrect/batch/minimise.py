@@ -225,7 +225,7 @@ class BatchMinimiser:
         self._d.copy_(-self._x)
         self._slope.copy_(dot(gradient, self._d))
         self._step.fill_(1.0)
-        self._threshold.copy_(FIRST_CHECK * self._tolerance)
+        self._threshold.copy_(self._unmoved.clamp(min=FIRST_CHECK) * self._tolerance)
         self.estimate.fill_(math.inf)
         self.iterations.zero_()
         self._tried.zero_()

@@ -212,7 +212,7 @@ def minimise(
     value, gradient = objective.value_and_gradient(p)
     x = solve(gradient)
     history = History(options.history, p.size)
-    threshold = FIRST_CHECK * options.tolerance
+    threshold = max(FIRST_CHECK, options.unmoved) * options.tolerance
     evaluations, estimate = 1, math.inf
     status = Status.ITERATION_LIMIT
     for iteration in range(options.max_iterations + 1):
