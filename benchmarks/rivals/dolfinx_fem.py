@@ -1,9 +1,9 @@
 """dolfinx: apt-get install --no-install-recommends python3-dolfinx (Debian 12: 0.5.2, 213 packages)
 
-The version of Debian 12, of early 2023; newer ones may be quicker.  Hexahedra of degree 1 or 2 (8 or
-27 nodes), consistent mass, the stable neo-Hookean energy in UFL, generalised-alpha (spectral radius
-0.8), dolfinx's Newton solver until the RMS increment is below 1e-5 of a cell, from the motion at the
-old acceleration, with MUMPS.  It brings no time steps, so those are written here.
+Debian's version is of October 2022; newer ones may be quicker.  Hexahedra of degree 1 or 2 (8 or 27
+nodes), consistent mass, the stable neo-Hookean energy in UFL, generalised-alpha (spectral radius
+0.8).  dolfinx's Newton solver with MUMPS starts from the motion at the old acceleration and stops
+where the RMS increment is below 1e-5 of a cell.  It has no time steps, so those are written here.
 FOLDER/dolfinx_fem/bin/python may be a link to the system's.
 """
 

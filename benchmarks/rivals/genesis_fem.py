@@ -1,9 +1,9 @@
 """Genesis: pip install genesis-world==1.4.5 torch
 
 Tetrahedra of 4 nodes with Hooke's law in the frame of each, at its rotation before the step; its
-implicit solver, backward Euler, in float64 on a CPU; only on the
-beam, as it compiles for half a minute before each run.  Its finite elements take no forces but
-a steady gravity, and start at rest.  Its Rayleigh damping, on by default, is off but for one run.
+implicit solver, backward Euler, in float64 on a CPU; only on the beam, as it compiles anew before
+each run.  Its finite elements take no forces but a steady gravity, and start at rest.  Its Rayleigh
+damping, on by default, is off but for one run.
 """
 
 from __future__ import annotations

@@ -48,7 +48,7 @@ def words(values) -> str:  # type: ignore[no-untyped-def]
 
 
 def masses(case: Case, order: int) -> np.ndarray:
-    """Of nodes (N,) of blocks of so many cells along each edge, kg: trapezoidal rule, or Simpson's."""
+    """Of the nodes (N,) of blocks of ``order`` cells along each edge, kg (Newton-Cotes)."""
     line = np.array([1, 1]) / 2 if order == 1 else np.array([1, 4, 1]) / 6
     nodes = block_nodes(case, order)
     shares = np.broadcast_to(np.einsum("i,j,k", line, line, line).ravel(), nodes.shape)
@@ -57,7 +57,7 @@ def masses(case: Case, order: int) -> np.ndarray:
 
 
 def blocks(case: Case, order: int) -> np.ndarray:
-    """Places (B, 3) of blocks of so many cells along each edge, of which the body has to be made."""
+    """Places (B, 3) of the blocks, of ``order`` cells along each edge, that make up the body."""
     found = np.unique(case.low // order, axis=0)
     if len(found) * order**3 != len(case.cells):
         raise Refused("27 nodes for cells that are no blocks of 2x2x2")

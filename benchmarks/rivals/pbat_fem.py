@@ -1,9 +1,8 @@
 """PBAT's finite elements: pip install pbatoolkit==0.0.11
 
 Tetrahedra of 4 or 10 nodes (hexahedra are for C++ only), the loop of its examples: backward Euler
-by one Newton step, consistent mass, sparse LDL^T.  "Converged": Newton steps until the largest
-increment is below 1e-5 of a cell.  Its stable neo-Hookean energy takes lambda + mu
-for lambda.
+by one Newton step, consistent mass, sparse LDL^T; "converged" are up to 20, until the largest
+increment is below 1e-5 of a cell.  Its stable neo-Hookean energy takes lambda + mu for lambda.
 """
 
 from __future__ import annotations

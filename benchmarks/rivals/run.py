@@ -190,7 +190,7 @@ def main() -> None:
             rows += [row for name in pythons for row in asked(name, case, frame)]
         rows.sort(key=order)
         left = list(rows)
-        for (rank, case), group in itertools.groupby(rows, lambda x: (order(x), x["case"])):
+        for _, group in itertools.groupby(rows, lambda x: (order(x), x["case"])):
             done = []
             for row in group:
                 if time.monotonic() - begin > chosen.seconds:
