@@ -28,9 +28,7 @@ TOLERANCE = 1e-5
 """Of a cell, for the largest increment."""
 
 
-def simulate(
-    case: Case, law: str, nodes: int, longest: float, newton: int
-) -> Iterator[np.ndarray]:
+def simulate(case: Case, law: str, nodes: int, longest: float, newton: int) -> Iterator[np.ndarray]:
     from pbatoolkit import pbat, pypbat
 
     fem, order = pbat.fem, 1 if nodes == 4 else 2
