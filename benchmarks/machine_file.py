@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 import re
+import shlex
 import sys
 import time
 from pathlib import Path
 from typing import Any
 
 from pdcorrect._environment import environment
+from pdcorrect._files import write_text
 
 RESULTS = Path(__file__).parent / "results"
 DIGITS = 5
@@ -34,18 +36,23 @@ def add(name: str, results: Any, device: str | None = None, prefix: str = "", **
     """
     machine, path = environment(), _path(device, prefix)
     record = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
-    script = Path(sys.argv[0]).resolve().relative_to(RESULTS.parents[1]).as_posix()
-    asked = [Path(x).name if Path(x).is_absolute() else x for x in sys.argv[1:]]
     record[name] = {
         "date": time.strftime("%Y-%m-%d"),
-        "command": " ".join(["python", script, *asked]),
+        "command": command(),
         "environment": machine | ({} if device is None else {"device": device}),
         **more,
         "results": results,
     }
     RESULTS.mkdir(exist_ok=True)
-    path.write_text(text(record), encoding="utf-8")
+    write_text(path, text(record))
     print(f"wrote {path}")
+
+
+def command() -> str:
+    """What this process was called by, without folders of this machine."""
+    script = Path(sys.argv[0]).resolve().relative_to(RESULTS.parents[1]).as_posix()
+    asked = [Path(x).name if Path(x).is_absolute() else x for x in sys.argv[1:]]
+    return shlex.join(["python", script, *asked])
 
 
 def read(name: str, prefix: str = "") -> dict[str, Any]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from statistics import median
+from statistics import median, median_low
 from typing import Any
 
 from records import Rows, number, read
@@ -17,7 +17,7 @@ ERROR, TIME = "error_percent", "cpu_ms_a_frame"
 
 def found() -> list[Row]:
     """Runs that came to an end."""
-    return [row for row in read(RECORD)["rivals"]["results"] if "failed" not in row]
+    return [row for row in read(RECORD)["rivals"]["results"] if ERROR in row]
 
 
 def label(row: Row) -> str:
@@ -84,12 +84,16 @@ def short() -> Rows:
 
 
 def ratios(rows: list[Row], run: list[Row], what: str, other: str) -> str:
-    """Median of a contestant's ``what`` over ours at its ``other``; 0 where we have none."""
+    """Low median of a contestant's ``what`` over ours at its ``other``.
+
+    0 where we have none, in so many scenes as the brackets say.
+    """
     shares = []
     for row in run:
         own = least(same(rows, row), row, what, other)
         shares.append(0.0 if own is None else row[what] / own)
-    return number(median(shares) or None, 2)
+    lacking = shares.count(0.0)
+    return number(median_low(shares) or None, 2) + (f" ({lacking})" if lacking else "")
 
 
 def of_scenes() -> Rows:
@@ -120,14 +124,12 @@ def left_out() -> Rows:
     for case, reason in record["refused"].items():
         reasons.setdefault(("all", reason), []).append(case)
     for row in record["results"]:
-        if "failed" in row:
-            reason = row["failed"].removeprefix("NotImplementedError: ")
-            key = row["contestant"]
-            if reason == row["failed"]:
-                key = label(row)
-            elif reason.startswith("cells"):
-                key = label(row).split(",")[0] + ", not 2x2x2"
-            reasons.setdefault((key, reason), []).append(row["case"])
+        if "refused" in row:
+            reasons.setdefault((row["contestant"], row["refused"]), []).append(row["case"])
+        elif "failed" in row:
+            reasons.setdefault((label(row), row["failed"]), []).append(row["case"])
+    for row in record["missing"]:
+        reasons.setdefault((label(row), "limit of time"), []).append(row["case"])
     return ("contestant", "reason", "scenes"), [
         [*key, ", ".join(dict.fromkeys(cases))] for key, cases in reasons.items()
     ]

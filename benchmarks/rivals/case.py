@@ -6,6 +6,8 @@ which yields the positions of ``case.points`` after each frame.  It runs in the 
 library, on a file that `cases.write` made:
 
     python SCRIPT CASE.npz SETTING OUT.npz
+
+What its library cannot do raises `Refused`, whose text is written to OUT.
 """
 
 from __future__ import annotations
@@ -22,7 +24,9 @@ import numpy as np
 
 Array = np.ndarray
 PARTS = 120
-"""Of a frame, for which mean amplitudes of loads are given: what steps a frame divide."""
+"""Parts of a frame for each of which the mean amplitude of a load is given.
+
+Where steps end with parts, means over them are exact."""
 MESHES = "refine", "scenes"
 _EVEN = np.array([[0, 2, 5, 7], [1, 0, 2, 5], [3, 0, 2, 7], [4, 0, 5, 7], [6, 2, 5, 7]])
 _ODD = np.array([[1, 3, 4, 6], [0, 1, 3, 4], [2, 1, 3, 6], [5, 1, 4, 6], [7, 3, 4, 6]])
@@ -30,6 +34,10 @@ _ODD = np.array([[1, 3, 4, 6], [0, 1, 3, 4], [2, 1, 3, 6], [5, 1, 4, 6], [7, 3, 
 _FACES = np.array(
     [[0, 4, 7, 3], [1, 2, 6, 5], [0, 1, 5, 4], [3, 7, 6, 2], [0, 3, 2, 1], [4, 5, 6, 7]]
 )
+
+
+class Refused(Exception):
+    """A contestant cannot simulate the case, for the reason given."""
 
 
 class Case:
@@ -89,8 +97,9 @@ class Case:
     def factors(self, substeps: int, at: float = 0.5) -> Array:
         """Mean amplitude of each load in each step, (frames, substeps, L).
 
-        Over a step's length around the time ``at`` which the step's equation holds, as a share of
-        it: so an impulse keeps its momentum.
+        Over a step's length around the time ``at``, a share of the step, at which its equation
+        holds.  So impulses are kept: what begins at once gives the rest, h (at - 0.5) times the
+        load at time 0, by a scheme's first acceleration.
         """
         length = PARTS / substeps
         middles = (np.arange(self.frames * substeps) + at) * length
@@ -110,7 +119,7 @@ class Case:
     def uniform(self, values: Array) -> float:
         """The one value of all cells."""
         if np.ptp(values):
-            raise NotImplementedError("several materials")
+            raise Refused("several materials")
         return float(values[0])
 
     @cached_property
@@ -179,10 +188,14 @@ def main(
     case = Case(path)
     wall, cpu, frames = [time.perf_counter()], [time.process_time()], [case.points[case.coarse]]
     chosen = {key: value for key, value in settings[setting].items() if key not in MESHES}
-    for positions in simulate(case, **chosen):
-        wall.append(time.perf_counter())
-        cpu.append(time.process_time())
-        frames.append(np.array(positions, dtype=float)[case.coarse])
-        if not np.isfinite(frames[-1]).all():
-            break
-    np.savez(out, positions=frames, wall=np.diff(wall), cpu=np.diff(cpu))
+    try:
+        for positions in simulate(case, **chosen):
+            wall.append(time.perf_counter())
+            cpu.append(time.process_time())
+            frames.append(np.array(positions, dtype=float)[case.coarse])
+            if not np.isfinite(frames[-1]).all():
+                break
+    except Refused as error:
+        np.savez(out, refused=str(error))
+    else:
+        np.savez(out, positions=frames, wall=np.diff(wall), cpu=np.diff(cpu))

@@ -17,7 +17,7 @@ def main() -> None:
     record, out = sys.argv[1:]
     points: dict[str, list[tuple[float, float]]] = {"ours": []}
     for row in json.loads(Path(record).read_text(encoding="utf-8"))["rivals"]["results"]:
-        if row["case"] == CASE and "failed" not in row:
+        if row["case"] == CASE and "error_percent" in row:
             point = 1e-3 * row["cpu_ms_a_frame"], 1e-2 * row["error_percent"]
             points.setdefault(row["contestant"].split("_")[0], []).append(point)
     named = {name: tuple(np.array(found).T) for name, found in points.items()}

@@ -15,10 +15,12 @@ PACKAGE = "newton"
 RECOMMENDED = ("1.67 ms, 10 iterations",)
 SETTINGS = {
     f"{1e3 * step:.3g} ms, {iterations} iterations": {
-        "law": "neo-hookean", "longest": step, "iterations": iterations, "refine": (1,),
+        "law": "neo-hookean", "longest": step, "iterations": iterations, "refine": refine,
         "scenes": scenes,
     }
-    for step, iterations, scenes in ((1 / 600, 10, (1,)), (1 / 600, 100, ()))
+    for step, iterations, refine, scenes in (
+        (1 / 600, 10, (1, 2), (1,)), (1 / 600, 100, (1,), ()),
+    )
 }  # fmt: skip
 
 

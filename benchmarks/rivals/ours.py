@@ -10,7 +10,7 @@ from case import Case, main
 PACKAGE = "pdcorrect"
 RECOMMENDED = ()
 _KINDS = {
-    "hex8, 1": ("hex8", 1, ()),
+    "hex8, 1": ("hex8", 1, (1,)),
     "best coarse, 1": ("hex8-enhanced", 1, (1,)),
     "hex27, 1": ("hex27", 1, (1,)),
     "learned, 1": ("hex8-learned", 1, (1,)),
