@@ -147,7 +147,7 @@ def frames(u, cells, shapes, sizes):  # type: ignore[no-untyped-def]
 
 
 @njit(**OPTIONS)
-def polar(U, s, V, l, size, cell):  # type: ignore[no-untyped-def]
+def _polar(U, s, V, l, size, cell):  # type: ignore[no-untyped-def]
     """R, S and Y of lane l."""
     for i in range(3):
         for j in range(3):
@@ -173,7 +173,7 @@ def _rise(t, rate):  # type: ignore[no-untyped-def]
 
 
 @njit(**OPTIONS)
-def cell_strains(cell, size):  # type: ignore[no-untyped-def]
+def _strains(cell, size):  # type: ignore[no-untyped-def]
     """Make z, still without fading, and A.
 
     Returns c and its derivative by A : dS, e and its by z . dz, that of tr E / 3 by A : dS, and
@@ -243,6 +243,15 @@ def pull(cell, measures, out):  # type: ignore[no-untyped-def]
 
 
 @njit(**OPTIONS)
+def strained(cell, found, l, size):  # type: ignore[no-untyped-def]
+    """Make ``cell`` the one of lane l of what `frames` found; returns as `_strains`."""
+    v, U, s, V = found
+    cell.v[:] = v[l]
+    _polar(U, s, V, l, size, cell)
+    return _strains(cell, size)
+
+
+@njit(**OPTIONS)
 def stress(K, z, factor, out):  # type: ignore[no-untyped-def]
     """Out (18,) = factor K z, for symmetric K, whose rows are added up."""
     for n in range(18):
@@ -265,11 +274,9 @@ def energy_and_forces(  # type: ignore[no-untyped-def]
     cell, out = new_cell(), np.empty((7, 3))
     for low in range(begin, end, CHUNK):
         high = min(end, low + CHUNK)
-        v, U, s, V = frames(u, cells[low:high], shapes[low:high], sizes[low:high])
+        found = frames(u, cells[low:high], shapes[low:high], sizes[low:high])
         for c in range(low, high):
-            cell.v[:] = v[c - low]
-            polar(U, s, V, c - low, sizes[c], cell)
-            measures = cell_strains(cell, sizes[c])
+            measures = strained(cell, found, c - low, sizes[c])
             fades = measures[0] * measures[2]
             stress(matrices[c], cell.z, fades, cell.y)
             total = 0.0
@@ -288,9 +295,7 @@ def strains(begin, end, u, cells, shapes, sizes, out):  # type: ignore[no-untype
     cell = new_cell()
     for low in range(begin, end, CHUNK):
         high = min(end, low + CHUNK)
-        v, U, s, V = frames(u, cells[low:high], shapes[low:high], sizes[low:high])
+        found = frames(u, cells[low:high], shapes[low:high], sizes[low:high])
         for c in range(low, high):
-            cell.v[:] = v[c - low]
-            polar(U, s, V, c - low, sizes[c], cell)
-            measures = cell_strains(cell, sizes[c])
+            measures = strained(cell, found, c - low, sizes[c])
             out[c] = measures[0] * measures[2] * cell.z

@@ -20,12 +20,11 @@ from pdcorrect.fem.turned_strains import (
     SHARES,
     THIRD,
     amplitudes,
-    cell_strains,
     frames,
     new_cell,
-    polar,
     pull,
     spread,
+    strained,
     stress,
 )
 
@@ -176,11 +175,9 @@ def tangents(  # type: ignore[no-untyped-def]
     ways, H = (X, r, dS, dA, dz, dZ, dy, dT, dw, rates), _ways(21)
     for low in range(begin, end, CHUNK):
         high = min(end, low + CHUNK)
-        v, U, s, V = frames(u, cells[low:high], shapes[low:high], sizes[low:high])
+        found = frames(u, cells[low:high], shapes[low:high], sizes[low:high])
         for c in range(low, high):
-            cell.v[:] = v[c - low]
-            polar(U, s, V, c - low, sizes[c], cell)
-            measures = cell_strains(cell, sizes[c])
+            measures = strained(cell, found, c - low, sizes[c])
             stress(matrices[c], cell.z, measures[0] * measures[2], g)
             if len(shift):
                 g -= shift[c]

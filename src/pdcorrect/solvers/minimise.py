@@ -78,8 +78,8 @@ class MinimiserOptions:
     """Policy of the loop.
 
     ``tolerance`` is the largest accepted estimate of the remaining displacement of a node, m, and
-    ``unmoved`` its share within which a start is accepted as it is; ``history`` are the pairs that
-    L-BFGS keeps, of which plain local/global has 0.
+    ``unmoved`` its share within which a start is accepted as it is, and from which it is judged;
+    ``history`` are the pairs that L-BFGS keeps, of which plain local/global has 0.
     """
 
     tolerance: float

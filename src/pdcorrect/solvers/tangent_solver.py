@@ -42,7 +42,7 @@ _CYCLE_SECONDS = 1.7e-8
 The cycle is cheaper on large meshes, but takes three to four times the iterations.
 """
 _TANGENT_SECONDS = 3.3e-8
-"""Of the cells' tangents, for each number of their shape functions' gradients (case newton)."""
+"""Of the cells' tangents, for each number of their gradients, of which only ratios matter."""
 _LARGEST_BAND = 2e9
 """Bytes; fixed, so that machines of usual size make the same choice."""
 _SOLVES = 50
